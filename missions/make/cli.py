@@ -62,7 +62,7 @@ from missions.make.flown import (
 )
 from missions.make.passes import Places, places_in
 from missions.make.spots_cli import spots
-from missions.make.trial_cli import trial
+from missions.make.trial import trial
 from missions.make.zones import Limits, Made, Wish, cells, make_zones, polygons
 from missions.maps.convert.formats import writer_for
 from missions.maps.model import MapFile, check_folder, digest, map_error, read_bytes

@@ -1,4 +1,4 @@
-"""Where the plots of a field trial lie: blocks with every treatment once, in random order.
+"""`vrspray make trial`: a randomised trial whose plots the sprayer can fly, and where they lie.
 
 A plot is whole passes wide. Along them it begins and ends with ground on which the rate settles,
 flown from either side; only what lies between counts (the inner part, which is harvested). As
@@ -7,17 +7,49 @@ strips the plots run as far as the field goes, side by side.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 import shapely
+import typer
 from shapely import Polygon
 from shapely.geometry.base import BaseGeometry
 
+from companion.atomic_write import write_atomically
+from companion.cli.answer import AsJson, Overrides, answer, note, problem_line, problem_object
+from companion.config import load
 from companion.wording import counted
 from missions.errors import PlanError
+from missions.make.arguments import (
+    MARGIN,
+    Boundary,
+    ConfigFile,
+    CourseDeg,
+    FormatName,
+    Margin,
+    NoSpray,
+    OutFile,
+    Picture,
+)
+from missions.make.flown import (
+    FlownField,
+    bounded,
+    check_rate,
+    draw_picture,
+    flown_field,
+    limits_of,
+    map_target,
+    numbers,
+    problems_of,
+    written,
+)
+from missions.maps.convert.formats import writer_for
 from missions.maps.local import polygons_of
+from missions.maps.model import MapFile, MapZone, check_folder, digest, not_written, read_bytes
 from missions.strips import Floats
 
 
@@ -161,3 +193,206 @@ def _free(ground: BaseGeometry, left_m: float, right_m: float) -> list[tuple[flo
             found.append((at, low))
         at = max(at, high)
     return found
+
+
+# -------------------------------------------------------------------------------------- the command
+
+VERSION = 1
+BLOCKS_MAX, TREATMENTS_MAX = 50, 20
+
+
+def trial(
+    out: OutFile,
+    config_file: ConfigFile,
+    rates: Annotated[str, typer.Option(metavar="R,R,...", help="L/ha of the treatments.")],
+    rest: Annotated[
+        float, typer.Option(metavar="R", help="L/ha on the ground around the plots.", min=0.0)
+    ],
+    check: Annotated[
+        float | None,
+        typer.Option(metavar="R", help="L/ha of a check in every block.", min=0.0),
+    ] = None,
+    blocks: Annotated[
+        int, typer.Option(metavar="N", help="Repeats of all treatments.", min=2, max=BLOCKS_MAX)
+    ] = 4,
+    plot_m: Annotated[
+        float,
+        typer.Option(metavar="M", help="Length of a plot along the passes.", min=1.0, max=10_000.0),
+    ] = 30.0,
+    strips: Annotated[
+        bool, typer.Option("--strips", help="Plots as long as the field, side by side.")
+    ] = False,
+    passes: Annotated[
+        int, typer.Option(metavar="N", help="Width of a plot in passes.", min=1, max=20)
+    ] = 1,
+    guard_m: Annotated[
+        float,
+        typer.Option(
+            metavar="M", help="At both sides of a plot, not harvested.", min=0.0, max=100.0
+        ),
+    ] = 0.5,
+    headland_m: Annotated[
+        float | None,
+        typer.Option(
+            metavar="M", help="Kept off the border; default: one swath.", min=0.0, max=1000.0
+        ),
+    ] = None,
+    margin: Margin = MARGIN,
+    seed: Annotated[
+        int, typer.Option(metavar="N", help="Of the random order; it is recorded.", min=0)
+    ] = 1,
+    boundary: Boundary = None,
+    no_spray: NoSpray = None,
+    angle_deg: CourseDeg = None,
+    png: Picture = None,
+    format_name: FormatName = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a map of this name.")] = False,
+    overrides: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Lay out a randomised trial that the sprayer can follow.
+
+    Beside the map NAME.trial.geojson holds plots, inner parts, treatments, blocks and the seed,
+    for `vrspray trial`, which evaluates the flight.
+
+    Exit 0: made; 1: made, and the check of the map found errors; 2: refused.
+    """
+    config = bounded(load(config_file, overrides=overrides or ()), boundary)
+    target = map_target(out)
+    record = target.with_name(f"{target.stem}.trial.geojson")
+    writer = writer_for(target, format_name)
+    for path in (out, *([] if png is None else [png])):
+        check_folder(path)
+    if record.exists() and not force:
+        raise PlanError(f"{record}: exists; another --out, or --force to replace it")
+    treatments = _treatments(rates, check)
+    field = flown_field(config, no_spray or [], angle_deg, "swath")
+    limits = limits_of(config, field.sprayer, margin)
+    for rate in filter(None, (*treatments, rest)):
+        check_rate(rate, limits, said=f"{rate:g} L/ha")
+    if not strips and plot_m < 3.0 * limits.least_m:
+        raise PlanError(
+            f"--plot-m {plot_m:g}: rates take {limits.least_m:.2f} m to settle at each end of a "
+            f"plot; give at least {3.0 * limits.least_m:.1f} m, or fly slower"
+        )
+    width_m = config.boom_table.width_m
+    if passes * width_m <= 2.0 * guard_m:
+        raise PlanError(f"--guard-m {guard_m:g}: nothing is left of {passes * width_m:g} m")
+    design = Design(
+        rates_l_ha=treatments, blocks=blocks, plot_m=None if strips else plot_m, wide=passes,
+        settle_m=limits.least_m, guard_m=guard_m, seed=seed,
+    )  # fmt: skip
+    ground = shapely.buffer(
+        field.turned(), -(width_m if headland_m is None else headland_m), join_style="mitre"
+    )
+    if ground.is_empty:
+        raise PlanError("--headland-m: no ground is left within it; give a smaller one")
+    plots = lay_out(ground, field.passes.edges_m, design)
+    map_file = _map_file(plots, design, field, target, rest)
+    problems = problems_of(map_file, config, field)
+    files = written(map_file, out, target, config, field, problems, writer.name, force=force)
+    text = _record(plots, design, field, rest, check=check is not None)
+    try:
+        write_atomically(record, (json.dumps(text, indent=1) + "\n").encode())
+    except OSError as error:
+        raise not_written(record, error) from None
+    if png is not None:
+        draw_picture(map_file, png, title=out.name)
+    ok = not any(problem.severity == "error" for problem in problems)
+    result = {
+        "ok": ok,
+        "files": [str(path) for path in (*files, record)],
+        **text["trial"],
+        "problems": [problem_object(problem) for problem in problems],
+        "plots": [
+            {"plot": plot.number, "block": plot.block, "rate_l_ha": treatments[plot.treatment]}
+            for plot in plots
+        ],
+    }
+    for problem in result["problems"]:
+        note(problem_line(problem))
+    answer(result, _lines(result, plots, design), as_json=as_json)
+    raise typer.Exit(0 if ok else 1)
+
+
+def _treatments(rates: str, check: float | None) -> tuple[float, ...]:
+    given = ([] if check is None else [check]) + numbers(rates, "--rates")
+    if len(set(given)) < max(len(given), 2):
+        raise typer.BadParameter("a trial compares two different rates or more, none of them twice")
+    if len(given) > TREATMENTS_MAX:
+        raise typer.BadParameter(f"a trial has at most {TREATMENTS_MAX} treatments")
+    return tuple(given)
+
+
+def _map_file(
+    plots: Sequence[Plot], design: Design, field: FlownField, target: Path, rest: float
+) -> MapFile:
+    areas = [plot.area() for plot in plots]
+    around = shapely.difference(field.turned(), shapely.union_all(areas))
+    zones = [
+        MapZone(
+            name=f"plot {plot.number}", geometry=field.degrees(area),
+            rate_l_ha=design.rates_l_ha[plot.treatment],
+        )
+        for plot, area in zip(plots, areas, strict=True)
+    ]  # fmt: skip
+    zones.append(MapZone(name="rest", geometry=field.degrees(around), rate_l_ha=rest))
+    return MapFile(
+        path=target, format="made", crs="EPSG:4326", unit="L/ha", rate_field="rate",
+        sha256=digest([read_bytes(field.boundary_file)]) if field.boundary_file.is_file() else "",
+        boundary=field.boundary, zones=tuple(zones),
+    )  # fmt: skip
+
+
+def _record(
+    plots: Sequence[Plot], design: Design, field: FlownField, rest: float, *, check: bool
+) -> dict[str, Any]:
+    """Return the trial as GeoJSON: its design, and a feature for each plot and its inner part."""
+
+    def feature(plot: Plot, part: str, area: shapely.Polygon) -> dict[str, Any]:
+        return {
+            "type": "Feature",
+            "properties": {
+                "plot": plot.number, "block": plot.block, "part": part,
+                "rate_l_ha": design.rates_l_ha[plot.treatment],
+            },
+            "geometry": json.loads(shapely.to_geojson(field.degrees(area))),
+        }  # fmt: skip
+
+    return {
+        "type": "FeatureCollection",
+        "trial": {
+            "version": VERSION,
+            "design": "strips" if design.plot_m is None else "plots",
+            "treatments_l_ha": list(design.rates_l_ha),
+            "check_l_ha": design.rates_l_ha[0] if check else None,
+            "rest_l_ha": rest,
+            "blocks": design.blocks,
+            "seed": design.seed,
+            "course_deg": field.passes.angle_deg,
+            "settle_m": design.settle_m,
+            "guard_m": design.guard_m,
+            "speed_m_s": field.sprayer.speed_m_s,
+        },
+        "features": [
+            one
+            for plot in plots
+            for one in (
+                feature(plot, "plot", plot.area()),
+                feature(plot, "inner", plot.inner(design)),
+            )
+        ],
+    }
+
+
+def _lines(result: dict[str, Any], plots: Sequence[Plot], design: Design) -> list[str]:
+    lines = [
+        f"course {result['course_deg']:g} deg; {design.blocks} blocks of "
+        f"{len(design.rates_l_ha)} {result['design']}, seed {design.seed}; the first and last "
+        f"{design.settle_m:.2f} m of each settle and do not count"
+    ]
+    for block in range(1, design.blocks + 1):
+        own = [plot for plot in plots if plot.block == block]
+        shown = ", ".join(f"{plot.number}: {design.rates_l_ha[plot.treatment]:g}" for plot in own)
+        lines.append(f"block {block}, {own[0].end_m - own[0].start_m:.1f} m each: {shown} L/ha")
+    return [*lines, *(f"written: {name}" for name in result["files"])]

@@ -17,8 +17,7 @@ from pyproj import CRS, Transformer
 from companion.config import load
 from companion.errors import ConfigError, VrsprayError
 from missions.make.flown import limits_of
-from missions.make.trial import Design, lay_out
-from missions.make.trial_cli import trial
+from missions.make.trial import Design, lay_out, trial
 from missions.maps.cli.options import plan_of
 
 pytestmark = pytest.mark.usefixtures("laid_out_once")
