@@ -23,7 +23,7 @@ EXCEPTIONS: dict[str, str] = {
     "analysis.journals.salvage": "what is done to a journal, apart from the command line",
     "analysis.journals.stray_rows": "what a page may be of; pure, apart from the copy it serves",
     "companion.output.hardware_pwm": "one output a file",
-    "missions.make.settled": "the optimum along a pass, apart from what it is of; pure",
+    "missions.make.zones": "the optimum along a pass, apart from what it is of; pure",
     "missions.worth": "its price of a layout is another than the one that the layouts share",
     "sitl.stub.actions": "knows both firmwares' commands, which know the autopilot's protocol",
 }

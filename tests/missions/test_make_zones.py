@@ -26,8 +26,7 @@ from missions.make.classes import classify, natural_breaks
 from missions.make.cleaning import Track, cleaned, is_track
 from missions.make.data import index_of
 from missions.make.passes import Passes, passes_of, places_in
-from missions.make.settled import settled
-from missions.make.zones import Limits, Wish, make_zones
+from missions.make.zones import Limits, Wish, make_zones, settled
 
 pytestmark = pytest.mark.usefixtures("laid_out_once")
 
