@@ -26,17 +26,6 @@ from companion.errors import Problem
 from companion.flight_map import is_flight_map
 from companion.wording import counted, install_command
 from missions.errors import PlanError
-from missions.make.arguments import (
-    MARGIN,
-    Boundary,
-    ConfigFile,
-    CourseDeg,
-    FormatName,
-    Margin,
-    NoSpray,
-    OutFile,
-    Picture,
-)
 from missions.make.classes import Method
 from missions.make.cleaning import STEPS, Step
 from missions.make.data import (
@@ -50,7 +39,16 @@ from missions.make.data import (
     write_points,
 )
 from missions.make.flown import (
+    MARGIN,
+    Boundary,
+    ConfigFile,
+    CourseDeg,
     FlownField,
+    FormatName,
+    Margin,
+    NoSpray,
+    OutFile,
+    Picture,
     bounded,
     draw_picture,
     flown_field,

@@ -1,4 +1,4 @@
-"""The field as it will be flown, and a made map from there to its file.
+"""The field as it will be flown, and a made map from there to its file; what all commands ask for it.
 
 All that `vrspray make` makes has this in common: the passes that `vrspray plan` lays, what the
 sprayer can follow on them, the checks of `map check`, and files, a flight map among them.
@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import shapely
@@ -225,3 +225,37 @@ def numbers(text: str, option: str) -> list[float]:
     if not all(math.isfinite(one) for one in found):
         raise typer.BadParameter(f"{option} takes finite numbers, not {text!r}")
     return found
+
+
+# ------------------------------------------------------------------------ arguments of the commands
+
+# A zone or a plot is this much longer than a change takes: for wind, and for the aircraft's speed.
+MARGIN = 1.5
+
+OutFile = Annotated[
+    Path, typer.Option("--out", metavar="FILE", help="The map; its suffix says the format.")
+]
+ConfigFile = Annotated[
+    Path, typer.Option("--config", metavar="FILE", help="Configuration of the flight.")
+]
+Boundary = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Field outline; default: prescription.boundary."),
+]
+NoSpray = Annotated[
+    list[Path] | None, typer.Option(metavar="FILE", help="Ground not to spray; repeatable.")
+]
+CourseDeg = Annotated[
+    float | None,
+    typer.Option(metavar="DEG", help="Course of the passes; default: as vrspray plan."),
+]
+Margin = Annotated[
+    float,
+    typer.Option(metavar="X", help="Times the length that a change takes.", min=1.0, max=20.0),
+]
+Picture = Annotated[
+    Path | None, typer.Option("--png", metavar="FILE", help="Picture: .png, .svg or .pdf.")
+]
+FormatName = Annotated[
+    str | None, typer.Option("--format", metavar="F", help="Where the suffix can hold several.")
+]

@@ -28,18 +28,16 @@ from companion.core.frame import LocalFrame
 from companion.wording import counted
 from missions.errors import PlanError
 from missions.files.write import check_suffix, write_fleet
-from missions.make.arguments import (
+from missions.make.data import in_degrees, points_of
+from missions.make.flown import (
     Boundary,
     ConfigFile,
     CourseDeg,
+    FlownField,
     FormatName,
     NoSpray,
     OutFile,
     Picture,
-)
-from missions.make.data import in_degrees, points_of
-from missions.make.flown import (
-    FlownField,
     bounded,
     check_rate,
     draw_picture,

@@ -24,19 +24,17 @@ from companion.cli.answer import AsJson, Overrides, answer, note, problem_line, 
 from companion.config import load
 from companion.wording import counted
 from missions.errors import PlanError
-from missions.make.arguments import (
+from missions.make.flown import (
     MARGIN,
     Boundary,
     ConfigFile,
     CourseDeg,
+    FlownField,
     FormatName,
     Margin,
     NoSpray,
     OutFile,
     Picture,
-)
-from missions.make.flown import (
-    FlownField,
     bounded,
     check_rate,
     draw_picture,
