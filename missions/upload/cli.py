@@ -17,8 +17,8 @@ from companion.config import load
 from companion.wording import counted
 from missions.errors import UploadError
 from missions.maps.compiling import compiled_setup
-from missions.upload.checks import FIRMWARES
 from missions.upload.items import (
+    FIRMWARES,
     GLOBAL,
     SAME_FRAME,
     WAYPOINT,

@@ -15,8 +15,18 @@ from pathlib import Path
 from typing import Literal, Protocol
 
 from missions.errors import UploadError
-from missions.upload.checks import FIRMWARES, Compared, blame, compare, crowded, refusal
-from missions.upload.items import Firmware, MissionFile, WireItem, misplaced
+from missions.upload.items import (
+    FIRMWARES,
+    Compared,
+    Firmware,
+    MissionFile,
+    WireItem,
+    blame,
+    compare,
+    crowded,
+    misplaced,
+    refusal,
+)
 
 What = Literal["mission", "fence"]
 Progress = Callable[[What, float], None]

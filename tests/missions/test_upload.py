@@ -16,9 +16,16 @@ import shapely
 from companion.cli.app import execute
 from companion.core.frame import LocalFrame
 from missions.errors import UploadError
-from missions.upload.checks import compare, crowded, refusal
 from missions.upload.cli import read_mission_file
-from missions.upload.items import Firmware, MissionFile, WireItem, elsewhere
+from missions.upload.items import (
+    Firmware,
+    MissionFile,
+    WireItem,
+    compare,
+    crowded,
+    elsewhere,
+    refusal,
+)
 from missions.upload.transfer import (
     NotNowError,
     Progress,
