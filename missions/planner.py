@@ -21,8 +21,7 @@ from missions.demand import M2_PER_HA, Demand, Rates, demands, valve_places
 from missions.errors import OutOfReachError, PlanError
 from missions.field import Field, local_points
 from missions.files.fence import Fences
-from missions.files.items import count_of, stops_of
-from missions.files.plan_rules import ITEMS_MAX
+from missions.files.items import ITEMS_MAX, count_of, stops_of
 from missions.fleet import fleet_sorties
 from missions.free_space import free_space
 from missions.layouts import flyable, is_small, spray_lines

@@ -12,8 +12,7 @@ from companion.wording import counted
 from missions.bands import main_course
 from missions.boom import boom_of
 from missions.energy import J_WH
-from missions.files.items import items_of
-from missions.files.plan_rules import ITEMS_MAX
+from missions.files.items import ITEMS_MAX, items_of
 from missions.plan import Plan, Sortie
 from missions.schedule import filled_of, separation_m
 from missions.strips import GRID_M, Floats, directions, lengths_m, whole

@@ -25,7 +25,7 @@ from companion.wording import counted
 from missions.errors import FenceError, PlanError
 from missions.fewer_corners import around_with_fewer_corners, each_inside, with_corners
 from missions.field import Field
-from missions.files.plan_rules import FENCE_CORNERS_MAX, NAMES
+from missions.files.items import FENCE_CORNERS_MAX, NAMES
 from missions.maps.local import polygons_of
 from missions.plan import Place, Plan, Settings, Sortie
 from missions.strips import Objects, border_edges

@@ -12,8 +12,15 @@ from xml.sax.saxutils import escape
 
 from missions.errors import PlanError
 from missions.files.fence import Fences, fence_content
-from missions.files.items import ABOVE_GROUND, RELATIVE, WAYPOINT, Item, items_of
-from missions.files.plan_rules import check_content, check_items
+from missions.files.items import (
+    ABOVE_GROUND,
+    RELATIVE,
+    WAYPOINT,
+    Item,
+    check_content,
+    check_items,
+    items_of,
+)
 from missions.maps.model import write_whole
 from missions.plan import Leg, Place, Plan, Sortie
 

@@ -29,7 +29,7 @@ from missions.fewer_corners import (
 )
 from missions.field import Field, build_field
 from missions.files.fence import Fences, fence_warnings
-from missions.files.plan_rules import FENCE_CORNERS_MAX
+from missions.files.items import FENCE_CORNERS_MAX
 from missions.files.write import geojson_text, plan_text
 from missions.free_space import CORNERS_MAX, free_space
 from missions.layouts import spray_lines

@@ -18,8 +18,7 @@ import missions.files
 from missions.demand import Uniform
 from missions.errors import PlanError
 from missions.field import build_field
-from missions.files.items import items_of
-from missions.files.plan_rules import FENCE_CORNERS_MAX, ITEMS_MAX, plan_problems
+from missions.files.items import FENCE_CORNERS_MAX, ITEMS_MAX, items_of, plan_problems
 from missions.files.write import plan_text, write_plan
 from missions.plan import Plan, Settings
 from missions.planner import plan_mission

@@ -11,8 +11,7 @@ from shapely import box
 from missions.demand import Uniform
 from missions.errors import PlanError
 from missions.field import build_field
-from missions.files.items import count_of, items_of, stops_of
-from missions.files.plan_rules import ITEMS_MAX
+from missions.files.items import ITEMS_MAX, count_of, items_of, stops_of
 from missions.plan import Plan, Settings
 from missions.planner import plan_mission
 from missions.sheet import sheet, sortie_lines

@@ -10,7 +10,7 @@ from typing import Literal
 import pytest
 
 from companion.errors import ConfigError
-from missions.files.plan_rules import plan_problems
+from missions.files.items import plan_problems
 from sitl.earth import Earth
 from sitl.serve_mission import mission_items
 from sitl.stub.flight import plan_flight
