@@ -40,9 +40,9 @@ from missions.reading import Asked, assumed, names_of, read_task
 from missions.reading_fleet import BreakAsked
 from missions.reading_ground import Autopilot, GroundAsked, label_warnings, parse_run_in, parse_wind
 from missions.reading_outline import CORRIDOR_MAX_M, RADIUS_MAX_M
+from missions.remaining import UntreatedRates
 from missions.searching import Watch, watched
 from missions.sheet import sheet, sortie_lines
-from missions.treated_rates import UntreatedRates
 
 # Attempted moves of the search: about one second, ten, and a minute on an old laptop.
 MOVES = {"quick": 40_000, "good": 300_000, "best": 2_000_000}

@@ -27,7 +27,7 @@ from missions.free_space import free_space
 from missions.layouts import flyable, is_small, spray_lines
 from missions.paced import Paced, in_room, range_warnings, room_warnings
 from missions.plan import Leg, Plan, Settings, Sortie, flown_lines, nose_s, sortie_wh
-from missions.remaining import Remaining
+from missions.remaining import Remaining, UntreatedRates, demands_once
 from missions.schedule import scheduled
 from missions.searching import lines_are_drawn
 from missions.sorties import Flying, SortieSearch
@@ -47,7 +47,6 @@ from missions.strips import (
     whole,
 )
 from missions.surroundings import NOTHING_AROUND, Pacing, Surroundings
-from missions.treated_rates import UntreatedRates, demands_once
 from missions.ways import Ways, build_ways, edge_places, far_warnings, suggested_depot
 
 # One sortie may begin and end anywhere: its depot is chosen among so many places of the edge.

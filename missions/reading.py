@@ -49,10 +49,9 @@ from missions.reading_outline import (
     read_obstacles,
     told,
 )
-from missions.remaining import Remaining
+from missions.remaining import Remaining, untreated_rates
 from missions.strips import Floats
 from missions.surroundings import NOTHING_AROUND, Surroundings
-from missions.treated_rates import untreated_rates
 
 # Where no configuration is given.
 DEFAULTS = Settings(swath_width_m=6.0, speed_m_s=6.0)

@@ -12,9 +12,8 @@ from shapely import Polygon, box
 
 from missions.demand import Uniform, demands
 from missions.errors import PlanError
-from missions.remaining import Break, read_lines, remaining
+from missions.remaining import Break, UntreatedRates, demands_once, read_lines, remaining
 from missions.strips import lengths_m
-from missions.treated_rates import UntreatedRates, demands_once
 from tests.bench.missions import FRAME
 from tests.missions.test_missions_cli import run, written
 
