@@ -24,7 +24,7 @@ from missions.maps.local import grown
 from missions.maps.registry import read_area
 from missions.plan import Settings
 from missions.reading_outline import near_features, told
-from missions.run_in import RunIn
+from missions.surroundings import RunIn
 from missions.terrain import Terrain, read_dem
 
 Autopilot = Literal["ardupilot", "px4"]

@@ -17,8 +17,7 @@ from missions.field import Field
 from missions.files.items import items_of
 from missions.plan import Plan
 from missions.planner import plan_mission
-from missions.run_in import RunIn
-from missions.surroundings import NOTHING_AROUND, Surroundings
+from missions.surroundings import NOTHING_AROUND, RunIn, Surroundings
 from missions.terrain import Dem, Terrain
 from tests.bench.missions import RATE_L_HA, fields, settings
 

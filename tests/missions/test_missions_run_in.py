@@ -19,9 +19,8 @@ from missions.field import Field, build_field
 from missions.files.write import write_plan
 from missions.plan import Leg, Plan, Settings
 from missions.planner import plan_mission
-from missions.run_in import RunIn
 from missions.stops import RUN_M, waypoints_of
-from missions.surroundings import NOTHING_AROUND, Surroundings
+from missions.surroundings import NOTHING_AROUND, RunIn, Surroundings
 from tests.bench.missions import FRAME, to_degrees
 from tests.missions.test_missions_cli import ANYANG, run, written
 from tests.missions.test_missions_wind import config_with
