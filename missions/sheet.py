@@ -9,11 +9,11 @@ import numpy as np
 import shapely
 
 from companion.wording import counted
-from missions.bands import main_course
 from missions.boom import boom_of
 from missions.energy import J_WH
 from missions.files.items import ITEMS_MAX, items_of
 from missions.plan import Plan, Sortie
+from missions.refill_search import main_course
 from missions.schedule import filled_of, separation_m
 from missions.strips import GRID_M, Floats, directions, lengths_m, whole
 
