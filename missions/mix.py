@@ -17,7 +17,7 @@ from companion.wording import counted
 from missions.demand import Rates, steps_of, valve_places
 from missions.errors import PlanError
 from missions.plan import Plan, Settings
-from missions.schedule import filled_of
+from missions.sheet import filled_of
 
 Measure = Literal["L", "kg"]
 # Litres or kilograms of a product in one of its units; "/ha" is for each hectare, else each litre.

@@ -28,8 +28,8 @@ from missions.layouts import flyable, is_small, spray_lines
 from missions.paced import Paced, in_room, range_warnings, room_warnings
 from missions.plan import Leg, Plan, Settings, Sortie, flown_lines, nose_s, sortie_wh
 from missions.remaining import Remaining, UntreatedRates, demands_once
-from missions.schedule import scheduled
 from missions.searching import lines_are_drawn
+from missions.sheet import scheduled
 from missions.sorties import Flying, SortieSearch
 from missions.spacing import Spacing
 from missions.speeds import choices, chosen, short_warnings, stretches_of

@@ -20,7 +20,7 @@ from missions.energy import Battery
 from missions.field import build_field
 from missions.plan import Plan, Settings
 from missions.planner import plan_mission
-from missions.schedule import separation_m
+from missions.sheet import separation_m
 from tests.bench.missions import (
     FRAME,
     RATE_L_HA,

@@ -37,7 +37,7 @@ from missions.maps.compiling import compiled_setup
 from missions.plan import Leg, Place, Plan, Sortie
 from missions.planner import plan_mission
 from missions.reading import Asked, Task, read_task
-from missions.schedule import scheduled
+from missions.sheet import scheduled
 from missions.strips import Floats
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile

@@ -14,8 +14,7 @@ from shapely.affinity import rotate
 from missions.errors import PlanError
 from missions.files.write import write_fleet
 from missions.plan import Plan
-from missions.schedule import separation_m, way_of
-from missions.sheet import sheet, sortie_lines
+from missions.sheet import separation_m, sheet, sortie_lines, way_of
 from missions.strips import rectangles
 from tests.bench.missions import comb, outside_m2, transit_outside_m
 from tests.missions.test_missions_plan import WIDTH_M, plan_of
