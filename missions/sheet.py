@@ -1,4 +1,4 @@
-"""What is known of each sortie before take-off: when it begins, what it finds, in words and as keys.
+"""What is known of each sortie before take-off: when, and what it finds, in words and as keys.
 
 It takes off after refill and fresh battery, and never beside another aircraft.
 

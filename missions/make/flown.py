@@ -1,4 +1,4 @@
-"""The field as it will be flown, and a made map from there to its file; what all commands ask for it.
+"""The field as it will be flown, what commands ask for it, and a made map from there to its file.
 
 All that `vrspray make` makes has this in common: the passes that `vrspray plan` lays, what the
 sprayer can follow on them, the checks of `map check`, and files, a flight map among them.

@@ -1,4 +1,4 @@
-"""A mission as it travels: numbers of MISSION_ITEM_INT, what a file holds, what a firmware refuses."""
+"""A mission as it travels: numbers of MISSION_ITEM_INT, what files hold and firmwares refuse."""
 
 from __future__ import annotations
 
