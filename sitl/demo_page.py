@@ -105,8 +105,7 @@ def sentence(result: DemoResult) -> str:
         if lag and wrong:
             missed = sum(one.missed for one in found)
             lost = f", {missed} {'change' if missed == 1 else 'changes'} missed," if missed else ""
-            how = "scheduled, each valve measured by itself" if method == CALIBRATED else method
-            parts.append(f"{lag}{lost} and {_range(wrong)} % with {how}")
+            parts.append(f"{method} {lag}{lost} and {_range(wrong)} %")
     return (
         "Mean distance of a change of rate from its boundary, and misapplied volume: "
         f"{'; '.join(parts)}."

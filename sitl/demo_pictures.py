@@ -112,8 +112,8 @@ def lags_figure(result: DemoResult) -> Figure:
     figure = new_figure(
         (10.0, 4.9),
         "Where the changes of rate fell",
-        "Distance along the track from the boundary to the volume-equivalent step of the true "
-        "flow, a point for every boundary and valve",
+        "How far past its boundary each change of rate took effect (below 0: too early), a point "
+        "for every boundary and valve",
     )
     left, right = figure.subplots(1, 2, width_ratios=(1.75, 1.0))
     figure.subplots_adjust(left=0.06, right=0.985, top=0.755, bottom=0.075, wspace=0.17)
@@ -129,7 +129,7 @@ def lags_figure(result: DemoResult) -> Figure:
     _published(left, speeds)
     left.set_title("All methods")
     left.set_ylabel("lag distance [m], above 0 too late")
-    right.set_title("scheduled alone; figures: absolute values")
+    right.set_title("scheduled only; means ignore the sign")
     right.set_ylabel("lag distance [cm], above 0 too late")
     reach_cm = max(REACH_CM, 1.3 * float(np.abs(right.get_ylim()).max()))
     right.set_ylim(-reach_cm, reach_cm)
@@ -285,7 +285,8 @@ def map_figure(result: DemoResult) -> Figure:
 
 
 def _title(flown: Flown) -> str:
-    title = f"Applied, {TITLES[flown.job.method]}"
+    how = "without compensation" if flown.job.method == "none" else "by vrspray"
+    title = f"Applied {how} ({TITLES[flown.job.method]})"
     share = flown.evaluation.misapplied_percent
     return title if share is None else f"{title}: {share:.1f} % misapplied"
 
