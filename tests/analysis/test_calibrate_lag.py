@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from analysis.calibrate_cli import TooFewStepsError, as_json, refusal, settings
 from analysis.calibration.flow_record import FlowRecord, record_of
 from analysis.calibration.identify import identify, jackknife, mean_of
-from analysis.calibration.result import TooFewStepsError, as_json, refusal, settings
 from analysis.calibration.steps import Kind, Reject, find_steps, is_trim
 from companion.cli.app import execute
 from companion.config import load

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 from typing import TYPE_CHECKING
 
-from analysis.calibration.result import settings
+from analysis.calibrate_cli import settings
 from analysis.evaluation import Evaluation, evaluate
 from companion.core.options.flow_trim import FlowTrim
 from sitl.flight import fly

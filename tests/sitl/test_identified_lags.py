@@ -11,8 +11,8 @@ from statistics import fmean
 import numpy as np
 import pytest
 
+from analysis.calibrate_cli import settings
 from analysis.calibration.identify import Identified
-from analysis.calibration.result import settings
 from sitl.anyang import PLANT
 from sitl.profile import draw_scatter, load_profile
 from tests.bench.identification import Task, fly_once
