@@ -26,9 +26,8 @@ from analysis.dose import misapplied_percent, section_error_percent, volume_erro
 from analysis.flight_record import FlightMeta, FlightRecord, whole_boom
 from analysis.flow_accuracy import flow_accuracy
 from analysis.holds import BESIDE_S, holds_of, with_unknown
-from analysis.lag import Step, Verdict, measure_steps
+from analysis.lag import SettledStep, Step, Verdict, measure_settled, measure_steps
 from analysis.published import P1_RESULTS
-from analysis.settled import SettledStep, measure_settled
 from analysis.strips import Strip, strips_of
 from analysis.track import tracks_of
 

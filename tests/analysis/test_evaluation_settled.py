@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from analysis.evaluation import FlightRecord, whole_boom
 from analysis.flown.modelled_flow import ML_S_PER_L_MIN
-from analysis.settled import measure_settled, ordered_ml_s
+from analysis.lag import measure_settled, ordered_ml_s
 from analysis.strips import strips_of
 from companion.core.nozzle import FlowCurve, NozzleSet
 from companion.core.types import TimedChange

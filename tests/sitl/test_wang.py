@@ -13,8 +13,8 @@ from statistics import fmean
 import pytest
 
 from analysis.evaluation import whole_boom
+from analysis.lag import SettledStep, measure_settled
 from analysis.published import p1_lag_distance_m
-from analysis.settled import SettledStep, measure_settled
 from analysis.strips import strips_of
 from companion.core.types import Telemetry
 from sitl.anyang import demo_setup, demo_trajectory
