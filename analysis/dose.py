@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from analysis.changes import SPEED_MIN_M_S
-from analysis.smoothing import rise_over
+from analysis.track import rise_over
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from analysis.changes import SPEED_MIN_M_S
-from analysis.smoothing import rise_over
+from analysis.track import rise_over
 from analysis.transitions import ML_M_PER_L_HA_M
 
 if TYPE_CHECKING:

@@ -24,8 +24,7 @@ import numpy as np
 from analysis.changes import Change, changes_of
 from analysis.flown.modelled_flow import flow_of, set_in_force
 from analysis.holds import sides_of
-from analysis.smoothing import rise_over
-from analysis.track import Bools, Floats, Ints, Track
+from analysis.track import Bools, Floats, Ints, Track, rise_over
 from analysis.transitions import (
     LEVEL_FROM,
     LEVEL_TO,

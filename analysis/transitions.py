@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.smoothing import rise_over, smoothed
-from analysis.track import Floats, Track
+from analysis.track import Floats, Track, rise_over, smoothed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

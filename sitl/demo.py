@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from analysis.evaluation import P1_RESULTS, Evaluation, evaluate, limit_ratio, whole_boom
 from analysis.flight_record import Fidelity
 from analysis.lag import ordered_ml_s
-from analysis.smoothing import boxed, rise_over
+from analysis.track import boxed, rise_over
 from companion.assembly import deliverable
 from companion.core.nozzle import flow_for_rate
 from companion.core.setup import Setup

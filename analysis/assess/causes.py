@@ -20,7 +20,7 @@ from analysis.changes import SPEED_MIN_M_S, ground_rates
 from analysis.flown.modelled_flow import ML_S_PER_L_MIN
 from analysis.holds import CLEAR_M
 from analysis.lag import Verdict
-from analysis.smoothing import rise_over
+from analysis.track import rise_over
 from analysis.transitions import ML_M_PER_L_HA_M
 from companion.core.nozzle import is_override
 
