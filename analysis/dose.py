@@ -1,4 +1,8 @@
-"""What fell on the ground against what was prescribed there: misapplied volume, dose of zones."""
+"""How much was applied against what was prescribed: on the ground, and in P1's total flow.
+
+SA_k = (1 - |S'_k - S_k| / S_k) 100 %, SA = mean of SA_k (P1 Eqs. 18 and 19). It says nothing where
+nothing is prescribed.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +14,17 @@ import numpy as np
 
 from analysis.changes import SPEED_MIN_M_S
 from analysis.track import rise_over
+from analysis.transitions import ML_M_PER_L_HA_M
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from analysis.strips import Strip
-    from analysis.track import Floats
+    from analysis.track import Bools, Floats
     from companion.core.boom import Boom
     from companion.core.prescription import Prescription
+
+# ------------------------------------------------------------------------------------ on the ground
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,3 +139,160 @@ def section_error_percent(strips: Sequence[Strip], boom: Boom) -> dict[str, floa
 
 def _error_percent(given_ml: float, asked_ml: float) -> float:
     return 100.0 * (given_ml - asked_ml) / asked_ml
+
+
+# ------------------------------------------------------------------------------------ in total flow
+
+SAMPLE_S = 0.01
+SETTLED_AFTER_S = 3.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlowAccuracy:
+    """Spraying accuracy of all samples, of those settled and of those after a start [%].
+
+    None where there is no such sample: short zones never settle.
+    """
+
+    all_percent: float | None
+    settled_percent: float | None
+    starting_percent: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlowSamples:
+    """P1's data points: SA_k [%], its time, and the one rate under all strips (else NaN).
+
+    `undefined` samples in the field had nothing prescribed: Eq. 18 divides by it.
+    """
+
+    time_s: Floats
+    accuracy_percent: Floats
+    rate_l_ha: Floats
+    undefined: int
+
+
+def flow_samples(strips: Sequence[Strip]) -> FlowSamples:
+    """Return SA_k of the total flow, one-period mean, every 10 ms in the field."""
+    track = strips[0].track
+    every = max(round(SAMPLE_S / track.step_s), 1)
+    time_s = track.time_s[::every]
+    given = np.zeros(len(time_s))
+    asked = np.zeros(len(time_s))
+    inside = np.ones(len(time_s), dtype=np.bool_)
+    moving = track.speed_m_s[::every] > SPEED_MIN_M_S
+    rate_l_ha = strips[0].rates_at(time_s)
+    for strip in strips:
+        each = strip.track
+        rates = strip.rates_at(time_s)
+        given += rise_over(each.volume_ml, each.period_steps)[::every] / each.period_s
+        metres_s = each.speed_m_s[::every] * each.across_m[::every]
+        asked += rates * ML_M_PER_L_HA_M * metres_s
+        inside &= strip.inside_at(time_s)
+        rate_l_ha = np.where(rates == rate_l_ha, rate_l_ha, np.nan)
+    counts = inside & moving & (asked > 0.0)
+    return FlowSamples(
+        time_s=time_s[counts],
+        accuracy_percent=100.0 * (1.0 - np.abs(given - asked)[counts] / asked[counts]),
+        rate_l_ha=rate_l_ha[counts],
+        undefined=int((inside & moving & ~(asked > 0.0)).sum()),
+    )
+
+
+def flow_accuracy(strips: Sequence[Strip]) -> FlowAccuracy:
+    """Return P1's SA of the total flow, one-period mean, sampled every 10 ms."""
+    samples = flow_samples(strips)
+    accuracy = samples.accuracy_percent
+    changed_s, started_s = _since(strips, samples.time_s)
+    return FlowAccuracy(
+        all_percent=_mean(accuracy),
+        settled_percent=_mean(accuracy[changed_s >= SETTLED_AFTER_S]),
+        starting_percent=_mean(accuracy[started_s < SETTLED_AFTER_S]),
+    )
+
+
+def _since(strips: Sequence[Strip], time_s: Floats) -> tuple[Floats, Floats]:
+    """Return the time since any strip's last change of rate, and since the boom's last start."""
+    starts = [run.start_s for strip in strips for run in strip.stretches]
+    edges_s = np.unique(np.array(starts))
+    # Between two edges every rate is constant: any time between them tells.
+    middles_s = np.append(0.5 * (edges_s[1:] + edges_s[:-1]), edges_s[-1] + 1e-6)
+    sprays = np.zeros(len(edges_s), dtype=np.bool_)
+    for strip in strips:
+        sprays |= strip.rates_at(middles_s) > 0.0
+    begins: Bools = sprays & ~np.concatenate(([False], sprays[:-1]))
+    return _last(edges_s, time_s), _last(edges_s[begins], time_s)
+
+
+def _last(events_s: Floats, time_s: Floats) -> Floats:
+    """Return the time since the last event; infinite before the first."""
+    padded = np.concatenate(([-np.inf], events_s))
+    since: Floats = time_s - padded[np.searchsorted(padded, time_s, "right") - 1]
+    return since
+
+
+def _mean(values: Floats) -> float | None:
+    return float(values.mean()) if len(values) else None
+
+
+# Spraying accuracy by prescribed rate, as P1's Table 5 has it.
+#
+# Eq. 19 is a mean over data points. A row here knows how many it has, so that rows add up, weighted
+# by them, to the accuracy of a flight, and the rows of several flights to those of all.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RateAccuracy:
+    """SA of the data points over one rate; the rate is None where the strips had several."""
+
+    rate_l_ha: float | None
+    percent: float
+    samples: int
+
+
+def accuracy_by_rate(strips: Sequence[Strip]) -> tuple[RateAccuracy, ...]:
+    """Return a flight's SA by rate, lowest first; what lay over several rates is last.
+
+    Transitions count for the rate that they lead to: its ground is where they are.
+    """
+    found = flow_samples(strips)
+    rates, accuracy = found.rate_l_ha, found.accuracy_percent
+    parts = [(float(rate), accuracy[rates == rate]) for rate in np.unique(rates[~np.isnan(rates)])]
+    parts.append((float("nan"), accuracy[np.isnan(rates)]))
+    return tuple(
+        RateAccuracy(
+            rate_l_ha=None if np.isnan(rate) else rate,
+            percent=float(part.mean()),
+            samples=len(part),
+        )
+        for rate, part in parts
+        if len(part)
+    )
+
+
+def pooled_by_rate(flights: Iterable[Iterable[RateAccuracy]]) -> tuple[RateAccuracy, ...]:
+    """Return the rows of all flights together, as if they had been one."""
+    by_rate: dict[float | None, list[RateAccuracy]] = {}
+    for flight in flights:
+        for row in flight:
+            by_rate.setdefault(row.rate_l_ha, []).append(row)
+    ordered = sorted(by_rate, key=lambda rate: float("inf") if rate is None else rate)
+    pooled = []
+    for rate in ordered:
+        percent = pooled_percent(by_rate[rate])
+        if percent is not None:
+            samples = sum(row.samples for row in by_rate[rate])
+            pooled.append(RateAccuracy(rate_l_ha=rate, percent=percent, samples=samples))
+    return tuple(pooled)
+
+
+def pooled_percent(rows: Iterable[RateAccuracy]) -> float | None:
+    """Return the SA of all data points of some rows; None without any.
+
+    >>> low = RateAccuracy(rate_l_ha=10.0, percent=90.0, samples=1)
+    >>> pooled_percent([low, RateAccuracy(rate_l_ha=20.0, percent=98.0, samples=3)])
+    96.0
+    """
+    each = list(rows)
+    samples = sum(row.samples for row in each)
+    return sum(row.percent * row.samples for row in each) / samples if samples else None

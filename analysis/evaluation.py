@@ -22,9 +22,13 @@ from analysis.border import (
     off_target_ml,
 )
 from analysis.changes import Run, find_runs, stretches_of
-from analysis.dose import misapplied_percent, section_error_percent, volume_error_percent
+from analysis.dose import (
+    flow_accuracy,
+    misapplied_percent,
+    section_error_percent,
+    volume_error_percent,
+)
 from analysis.flight_record import FlightMeta, FlightRecord, whole_boom
-from analysis.flow_accuracy import flow_accuracy
 from analysis.holds import BESIDE_S, holds_of, with_unknown
 from analysis.lag import SettledStep, Step, Verdict, measure_settled, measure_steps
 from analysis.published import P1_RESULTS

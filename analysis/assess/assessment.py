@@ -24,9 +24,8 @@ import numpy as np
 from analysis.assess.breakdowns import Breakdowns, breakdowns, ways_between
 from analysis.assess.causes import Cause, Causes, causes_of
 from analysis.assess.cell_maps import CellMaps, cell_maps
-from analysis.dose import misapplied_parts
+from analysis.dose import flow_samples, misapplied_parts
 from analysis.evaluation import Changes, Evaluation, changes_of, evaluate_strips
-from analysis.flow_accuracy import flow_samples
 from analysis.flown.applied_record import STEP_S, Source, modelled_ml, record_of
 from analysis.flown.holes import GAP_S
 from analysis.flown.modelled_flow import counted, ordered_s

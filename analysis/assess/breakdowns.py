@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from analysis.flow_accuracy import flow_samples
+from analysis.dose import flow_samples
 from analysis.lag import Verdict
 from analysis.student import NOTHING, Interval, crossings_of, mean_interval
 

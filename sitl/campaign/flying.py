@@ -13,8 +13,8 @@ from pathlib import Path
 from time import process_time
 from typing import TYPE_CHECKING, Any, Literal, cast
 
+from analysis.dose import accuracy_by_rate
 from analysis.evaluation import Distances, Evaluation, evaluate_strips, limit_ratio, whole_boom
-from analysis.flow_accuracy import accuracy_by_rate
 from analysis.strips import strips_of
 from companion.config import load
 from companion.errors import ConfigError

@@ -20,8 +20,8 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, Literal
 
+from analysis.dose import RateAccuracy, pooled_by_rate, pooled_percent
 from analysis.evaluation import Distances
-from analysis.flow_accuracy import RateAccuracy, pooled_by_rate, pooled_percent
 from analysis.published import (
     P1_RATES_L_HA,
     P1_RESULTS,

@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from analysis.evaluation import Distances
-from analysis.flow_accuracy import (
+from analysis.dose import (
     RateAccuracy,
     accuracy_by_rate,
     flow_accuracy,
     pooled_by_rate,
     pooled_percent,
 )
+from analysis.evaluation import Distances
 from analysis.published import (
     P1_RATES_L_HA,
     P1_SPRAYING_ACCURACY_PERCENT,
