@@ -18,8 +18,8 @@ import shapely
 from numpy.typing import NDArray
 from pyproj import Geod
 
+from analysis.exports.cli import FORMATS, format_for
 from analysis.exports.output import write_beside
-from analysis.exports.registry import FORMATS, format_for
 from analysis.exports.source import Shape, Source
 from analysis.flown.applied_flight import AppliedFlight
 from analysis.flown.read_applied import read_applied

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from analysis.exports.cli import FORMATS, format_for
 from analysis.exports.columns import plain_names
 from analysis.exports.output import ExportError, write_beside, write_folder
-from analysis.exports.registry import FORMATS, format_for
 from companion.cli.app import execute
 from companion.journal.journal import Journal
 from tests.analysis.export_flight import fly

@@ -20,9 +20,9 @@ import pytest
 from isoxml.models.ddi_entities import DDEntity
 from isoxml.util.isoxml_io import isoxml_from_path
 
+from analysis.exports.cli import format_for
 from analysis.exports.isoxml_task import logged, records
 from analysis.exports.output import write_beside, write_folder
-from analysis.exports.registry import format_for
 from analysis.exports.source import Source
 from analysis.flown.applied_flight import AppliedFlight
 from analysis.flown.read_applied import read_applied

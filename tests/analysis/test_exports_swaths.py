@@ -13,7 +13,7 @@ from hypothesis import given as drawn
 from hypothesis import settings
 from hypothesis import strategies as st
 
-from analysis.exports.registry import FORMATS
+from analysis.exports.cli import FORMATS
 from analysis.exports.source import Source
 from analysis.exports.swaths import LENGTH_M, outlines, swaths_of
 from analysis.flight_record import FlightRecord

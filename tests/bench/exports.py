@@ -9,7 +9,7 @@ import sys
 import time
 from pathlib import Path
 
-from analysis.exports.registry import FORMATS, Format
+from analysis.exports.cli import FORMATS, Format
 from analysis.exports.source import Shape, Source
 from analysis.flown.read_applied import read_applied
 
