@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from analysis.exports.samples import Samples
-    from analysis.exports.swaths import Swaths
+    from analysis.exports.samples import Samples, Swaths
     from analysis.flown.applied_flight import AppliedFlight
 
 UNKNOWN = "unknown"

@@ -24,9 +24,8 @@ from analysis.exports.output import zipped
 
 if TYPE_CHECKING:
     from analysis.exports.output import Content
-    from analysis.exports.samples import Samples
+    from analysis.exports.samples import Samples, Swaths
     from analysis.exports.source import Source
-    from analysis.exports.swaths import Swaths
 
 Floats = NDArray[np.float64]
 

@@ -16,8 +16,7 @@ from analysis.exports.columns import (
     swath_columns,
     units_of,
 )
-from analysis.exports.samples import Samples, samples_of
-from analysis.exports.swaths import Swaths, swaths_of
+from analysis.exports.samples import Samples, Swaths, samples_of, swaths_of
 from analysis.flight_record import FlightRecord
 from analysis.flown.applied_flight import AppliedFlight
 from analysis.flown.applied_record import record_of

@@ -14,8 +14,8 @@ from hypothesis import settings
 from hypothesis import strategies as st
 
 from analysis.exports.cli import FORMATS
+from analysis.exports.samples import LENGTH_M, outlines, swaths_of
 from analysis.exports.source import Source
-from analysis.exports.swaths import LENGTH_M, outlines, swaths_of
 from analysis.flight_record import FlightRecord
 from analysis.flown.applied_flight import AppliedFlight
 from analysis.flown.read_applied import read_applied
