@@ -16,17 +16,22 @@ from numpy.typing import NDArray
 
 from analysis.wsp.corrected import Corrected, corrected
 from analysis.wsp.image import FLAT, YELLOW_ABOVE_BLUE, Found, Rectangle, Sheet, find_cards
-from analysis.wsp.sizes import (
+from analysis.wsp.stains import (
     DEPOSITSCAN,
     LEAST_DROP_UM,
+    THRESHOLD,
     UM2_PER_CM2,
+    UNRELIABLE_PERCENT,
     Sizes,
     Spread,
+    Stains,
+    Threshold,
+    grey_of,
     second_of,
+    segment,
     sizes,
     stain_um,
 )
-from analysis.wsp.stains import THRESHOLD, UNRELIABLE_PERCENT, Stains, Threshold, grey_of, segment
 from companion.errors import VrsprayError
 
 Bytes = NDArray[np.uint8]

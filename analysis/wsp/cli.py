@@ -37,8 +37,7 @@ from analysis.wsp.results import (
     summary,
     table_lines,
 )
-from analysis.wsp.sizes import SPREADS, spread_of
-from analysis.wsp.stains import THRESHOLD, Threshold
+from analysis.wsp.stains import SPREADS, THRESHOLD, Threshold, spread_of
 from companion.atomic_write import write_atomically
 from companion.cli.answer import AsJson, answer, note
 from companion.errors import ConfigError, JournalError

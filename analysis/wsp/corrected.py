@@ -15,8 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from analysis.wsp.sizes import LEAST_DROP_UM, Spread, sizes, stain_um
-from analysis.wsp.stains import LEAST_CONTRAST, Outlines, Stains, drops_px, outlines_of, segment
+from analysis.wsp.stains import (
+    LEAST_CONTRAST,
+    LEAST_DROP_UM,
+    Outlines,
+    Spread,
+    Stains,
+    drops_px,
+    outlines_of,
+    segment,
+    sizes,
+    stain_um,
+)
 
 # Stains at the limit of what counts: found where blur leaves no pixel dark, sized by their peaks.
 #

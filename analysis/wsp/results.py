@@ -18,8 +18,7 @@ from analysis.wsp.card import (
     Method,
     SheetResult,
 )
-from analysis.wsp.sizes import LEAST_DROP_UM, second_of
-from analysis.wsp.stains import LAW, UNRELIABLE_PERCENT
+from analysis.wsp.stains import LAW, LEAST_DROP_UM, UNRELIABLE_PERCENT, second_of
 
 # Columns of a card's figures, in the order of CSV; those of the second spread factor follow.
 SIZES = (

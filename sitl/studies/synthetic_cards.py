@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from analysis.wsp.image import Rectangle
-from analysis.wsp.sizes import LEAST_DROP_UM
+from analysis.wsp.stains import LEAST_DROP_UM
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float64]

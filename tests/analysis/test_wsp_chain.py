@@ -9,17 +9,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.wsp.sizes import (
+from analysis.wsp.stains import (
     DEPOSITSCAN,
     SPREADS,
     SpreadError,
     fraction_um,
+    grey_of,
+    midway,
     second_of,
+    segment,
     sizes,
     spread_of,
     stain_um,
 )
-from analysis.wsp.stains import grey_of, midway, segment
 
 PX_UM = 25_400.0 / 600.0
 ALL = np.ones((8, 8), dtype=np.bool_)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from analysis.wsp.corrected import by_peak, corrected, full_grey, with_faint
-from analysis.wsp.sizes import DEPOSITSCAN
-from analysis.wsp.stains import grey_of, segment
+from analysis.wsp.stains import DEPOSITSCAN, grey_of, segment
 from sitl.studies.synthetic_cards import Scanner, Spray, TrueSheet, draw_card
 
 MIST = Spray(drops_per_cm2=40.0, nmd_um=75.0, sigma=1.6)

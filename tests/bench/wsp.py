@@ -22,7 +22,7 @@ import numpy as np
 
 from analysis.wsp.card import INSET_MM, Card, Method, Reading, SheetResult, read_sheet
 from analysis.wsp.image import sheets_of
-from analysis.wsp.sizes import LEAST_DROP_UM
+from analysis.wsp.stains import LEAST_DROP_UM
 from sitl.studies.synthetic_cards import Scanner, Spray, TrueSheet, a4_places, draw_sheet, save
 
 CARDS = 10
