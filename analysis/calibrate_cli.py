@@ -81,8 +81,8 @@ def lag(
 
     Exit 0: all lags; 1: too few good steps of a kind; 2: the file or an option cannot be used.
     """
-    from analysis.calibration.flow_record import record_of
     from analysis.calibration.identify import identify
+    from analysis.calibration.steps import record_of
 
     pass
     pass

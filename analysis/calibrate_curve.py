@@ -41,7 +41,7 @@ from companion.errors import ConfigError
 
 if TYPE_CHECKING:
     from analysis.calibration.curve import CurveCourse, SetCurve
-    from analysis.calibration.flow_record import FlowRecord
+    from analysis.calibration.steps import FlowRecord
     from companion.config import Config
 
 FORMAT = "vrspray-curve-1"

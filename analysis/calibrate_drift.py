@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from analysis.calibration.flow_record import FlowRecord, record_of
 from analysis.calibration.identify import Estimate
+from analysis.calibration.steps import FlowRecord, record_of
 from analysis.calibration.valves import WORN_SHARE
 from companion.cli.answer import AsJson, answer, note
 from companion.errors import JournalError
@@ -26,7 +26,7 @@ from companion.errors import JournalError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from analysis.calibration.flow_record import Floats, Order
+    from analysis.calibration.steps import Floats, Order
     from companion.core.schedule import LagModel
     from companion.core.setup import Setup
 

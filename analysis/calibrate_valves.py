@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from analysis.calibration.flow_record import CarriedOut, FlowRecord, Order, orders_of
+from analysis.calibration.steps import CarriedOut, FlowRecord, Order, orders_of
 from analysis.calibration.valves import (
     CYCLES,
     WORN_SHARE,

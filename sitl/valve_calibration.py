@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from analysis.calibration.curve import Weighed, curve_course, identify_curve
-from analysis.calibration.flow_record import CarriedOut, FlowRecord, orders_of
-from analysis.calibration.steps import Kind
+from analysis.calibration.steps import CarriedOut, FlowRecord, Kind, orders_of
 from analysis.calibration.valves import (
     CYCLES,
     Piece,

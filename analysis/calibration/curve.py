@@ -24,7 +24,7 @@ from companion.ground.work import PIECE_MAX_S, GroundKind, GroundTask, Phase
 from companion.output.pwm import stagger
 
 if TYPE_CHECKING:
-    from analysis.calibration.flow_record import Floats, FlowRecord
+    from analysis.calibration.steps import Floats, FlowRecord
     from companion.core.schedule import LagModel
     from companion.core.types import PwmLimits
 

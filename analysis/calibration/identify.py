@@ -15,8 +15,7 @@ from analysis.calibration.steps import Kind, Reject, Step, find_steps, settle_s
 from analysis.student import t_factor
 
 if TYPE_CHECKING:
-    from analysis.calibration.flow_record import Floats, FlowRecord
-    from analysis.calibration.steps import Step
+    from analysis.calibration.steps import Floats, FlowRecord, Step
     from companion.core.schedule import LagModel
 
 

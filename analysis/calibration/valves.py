@@ -33,7 +33,7 @@ from companion.errors import VrsprayError
 from companion.ground.work import PIECE_MAX_S, GroundKind, GroundTask, Phase
 
 if TYPE_CHECKING:
-    from analysis.calibration.flow_record import Floats, FlowRecord
+    from analysis.calibration.steps import Floats, FlowRecord
     from companion.core.schedule import LagModel
     from companion.core.types import PwmLimits
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from analysis.calibration.flow_record import Floats, FlowRecord, Order
+from analysis.calibration.steps import Floats, FlowRecord, Order
 from companion.core.schedule import LagModel
 
 PERIOD_S = 1.0 / 11.0

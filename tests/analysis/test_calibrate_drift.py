@@ -16,8 +16,8 @@ from analysis.calibrate_drift import (
     verdict_of,
     windows_of,
 )
-from analysis.calibration.flow_record import FlowRecord, Order
 from analysis.calibration.identify import Estimate
+from analysis.calibration.steps import FlowRecord, Order
 from companion.cli.app import execute
 from companion.config import load
 from companion.core.setup import Setup

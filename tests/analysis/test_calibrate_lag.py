@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from analysis.calibrate_cli import TooFewStepsError, as_json, refusal, settings
-from analysis.calibration.flow_record import FlowRecord, record_of
 from analysis.calibration.identify import identify, jackknife, mean_of
-from analysis.calibration.steps import Kind, Reject, find_steps, is_trim
+from analysis.calibration.steps import FlowRecord, Kind, Reject, find_steps, is_trim, record_of
 from companion.cli.app import execute
 from companion.config import load
 from companion.core.schedule import LagModel

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from analysis.calibrate_cli import settings as to_paste
-from analysis.calibration.flow_record import FlowRecord
 from analysis.calibration.identify import Meter, identify
+from analysis.calibration.steps import FlowRecord
 from companion.core.schedule import LagModel
 from tests.analysis.calibration_bench import PERIOD_S, Bench, metered
 

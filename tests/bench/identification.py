@@ -23,9 +23,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from analysis.calibration.flow_record import record_of
 from analysis.calibration.identify import Identified, identify, trimmed_ml
-from analysis.calibration.steps import Kind
+from analysis.calibration.steps import Kind, record_of
 from companion.config import load
 from companion.core.types import Decision, FlowReport
 from missions.maps.compiling import compiled_setup

@@ -28,7 +28,7 @@ from analysis.calibration.curve import (
     curve_course,
     identify_curve,
 )
-from analysis.calibration.flow_record import CarriedOut, FlowRecord, Order
+from analysis.calibration.steps import CarriedOut, FlowRecord, Order
 from analysis.write_back import write_back
 from companion.cli.app import execute
 from companion.config import load

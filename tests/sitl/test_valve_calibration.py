@@ -17,8 +17,7 @@ from analysis.calibrate_valves import (
     read_record,
     write_record,
 )
-from analysis.calibration.flow_record import CarriedOut
-from analysis.calibration.steps import Kind
+from analysis.calibration.steps import CarriedOut, Kind
 from analysis.calibration.valves import (
     READINGS_MIN,
     Course,
