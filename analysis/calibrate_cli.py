@@ -83,9 +83,6 @@ def lag(
     """
     from analysis.calibration.identify import identify
     from analysis.calibration.steps import record_of
-
-    pass
-    pass
     from analysis.journals.content import read_journal
 
     check_asked(config, is_write=is_write)
@@ -109,7 +106,7 @@ def lag(
             note(f"no picture: matplotlib is missing; {install_command('office')}")
         except (OSError, ValueError) as error:
             raise ConfigError(f"--plot {plot}: cannot be written ({error})") from error
-    result = as_json(found)
+    result = lag_result(found)
     changed = written_lines(config, result, is_write=is_write)
     answer(result, [*table_lines(found), *changed], as_json=as_json)
 
@@ -261,7 +258,7 @@ def settings(found: Identified) -> dict[str, float]:
     return chosen | {"output_s": found.output_s}
 
 
-def as_json(found: Identified) -> dict[str, Any]:
+def lag_result(found: Identified) -> dict[str, Any]:
     """Return the answer in the shape of the contract, and what was not used."""
     result: dict[str, Any] = {
         key: {

@@ -1,4 +1,4 @@
-"""Command line of the exports: a journal in, a file that others read out, in one of these formats."""
+"""Command line of the exports: a journal in, a file that others read out; and which formats."""
 
 from __future__ import annotations
 
@@ -183,7 +183,6 @@ def export_journal(
     Exit 0: all of the flight; 1: the journal was cut, is damaged, lacks rows or is of another
     version, and what can be read was written; 2: no journal, or an option or OUT cannot be used.
     """
-    pass
     from analysis.exports.source import Source
     from analysis.flown.applied_record import EvaluationError
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.calibrate_cli import TooFewStepsError, as_json, refusal, settings
+from analysis.calibrate_cli import TooFewStepsError, lag_result, refusal, settings
 from analysis.calibration.identify import identify, jackknife, mean_of
 from analysis.calibration.steps import FlowRecord, Kind, Reject, find_steps, is_trim, record_of
 from companion.cli.app import execute
@@ -215,7 +215,7 @@ def test_too_few_steps_are_refused_by_name() -> None:
     assert why is not None
     assert "on 4" in why and "needs 6" in why and "\n" not in why
     with pytest.raises(TooFewStepsError, match="too few good steps"):
-        as_json(found)
+        lag_result(found)
 
 
 def test_a_meter_that_stands_still_answers_nothing() -> None:
