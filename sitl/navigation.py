@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from companion.core.types import AttitudeReport, ImuReport, SpeedReport, Telemetry
-from sitl.leaning import GRAVITY_M_S2, MEAN_S, Leaning, leaning
 from sitl.trajectory import Trajectory
+from sitl.vehicle import GRAVITY_M_S2, MEAN_S, Leaning, leaning
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from itertools import count
 from typing import Protocol
 
-from sitl.leaning import MEAN_S, Leaning, leaning
 from sitl.stub import actions, commands, mission
 from sitl.stub.faults import Fault, FaultClock, FaultKind, rc_pulses_us
 from sitl.stub.firmware import Parts, Upload
@@ -31,6 +30,7 @@ from sitl.stub.protocol import (
 from sitl.stub.sprayer import Battery
 from sitl.stub.streams import Strangers
 from sitl.stub.world import Pose
+from sitl.vehicle import MEAN_S, Leaning, leaning
 
 UTC_START_S = 1_774_080_000.0  # 2026-03-21 08:00
 

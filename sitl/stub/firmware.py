@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from sitl.leaning import Leaning
 from sitl.stub.faults import Fault, FaultClock, FaultKind
 from sitl.stub.flight import Flight
 from sitl.stub.mission_items import INFO, MissionItem
@@ -21,6 +20,7 @@ from sitl.stub.parameters import Parameters
 from sitl.stub.protocol import Channel, Message, SigningKey, dialect
 from sitl.stub.sprayer import Battery
 from sitl.stub.world import Estimator, Pose
+from sitl.vehicle import Leaning
 
 Params = tuple[float, ...]
 Builder = Callable[["Autopilot", float], Message]

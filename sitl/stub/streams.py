@@ -8,12 +8,12 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from sitl.leaning import GRAVITY_M_S2
 from sitl.stub.faults import RC_COUNT, FaultKind, rc_pulses_us
 from sitl.stub.firmware import Builder
 from sitl.stub.mission_items import LANDED_STATES
 from sitl.stub.protocol import Message, clipped, dialect
 from sitl.stub.world import Pose
+from sitl.vehicle import GRAVITY_M_S2
 
 if TYPE_CHECKING:
     from sitl.stub.firmware import Autopilot

@@ -12,10 +12,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.core.options.inertial import Inertia
 from companion.core.types import AttitudeReport, ImuReport
 from companion.link.codec import Codec
-from sitl.leaning import DRAG_1_S, GRAVITY_M_S2, MEAN_S, Leaning, leaning
 from sitl.stub.firmware import Autopilot
 from sitl.stub.streams import attitude, highres_imu, scaled_imu
 from sitl.trajectory import Truth
+from sitl.vehicle import DRAG_1_S, GRAVITY_M_S2, MEAN_S, Leaning, leaning
 
 HEADING_DEG = 130.0
 EAST_M_S2, NORTH_M_S2 = 1.8, -0.7
