@@ -39,13 +39,21 @@ from companion.core.types import (
     VehicleState,
 )
 from companion.output.pwm import PulseEngine
-from sitl.board import SERVO_FRAME_S, DriverBoard
 from sitl.drives import DrivenOutput, DriveTruth, Motors, Ranges
 from sitl.earth import Earth
 from sitl.knowledge import KnowingOutput, WaitingForDuties, WaitingForEdges, pwm_limits
 from sitl.liquid_faults import LiquidFault, LiquidSensors
 from sitl.navigation import SPEED_REPORT_RATE_HZ, WANDER_SD_M, Navigation
-from sitl.outputs import WIRE_S, AveragedOutput, Output, PlanFollower, ServoOutput, TakesEdges
+from sitl.outputs import (
+    SERVO_FRAME_S,
+    WIRE_S,
+    AveragedOutput,
+    DriverBoard,
+    Output,
+    PlanFollower,
+    ServoOutput,
+    TakesEdges,
+)
 from sitl.own_method import MakeController, OwnFlight, Sprayer, made
 from sitl.plants import duty_plant, edge_plant
 from sitl.trajectory import Route

@@ -42,11 +42,10 @@ from companion.core.types import (
 from companion.errors import ConfigError
 from missions.maps.compiling import compiled_setup
 from missions.maps.model import Problem
-from sitl.board import SERVO_FRAME_S
 from sitl.flight import FlightOptions, FlightResult, fly, true_profile
 from sitl.knowledge import perfect_setup
 from sitl.motor_parts import check_motors, droplet_figures, fits, ranges_us
-from sitl.outputs import WIRE_S
+from sitl.outputs import SERVO_FRAME_S, WIRE_S
 from sitl.own_method import MakeController, load_controller
 from sitl.profile import PROFILES, PlantProfile, load_profile
 from sitl.routes import SPEED_MAX_M_S, SPEED_MIN_M_S, legs_over, read_route

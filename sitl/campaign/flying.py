@@ -31,7 +31,6 @@ from sitl.anyang import (
     demo_route,
     scaled,
 )
-from sitl.board import SERVO_FRAME_S
 from sitl.campaign.settings import P1S_FIELD, Settings, Value, overrides_of, with_plant
 from sitl.disturbances import RATE_HZ, Disturbance, displaced, drifted, shortened
 from sitl.flight import FlightOptions, FlightResult, fly, true_profile
@@ -39,7 +38,7 @@ from sitl.fly import DEFAULT_ACCELERATION_M_S2, FlyOptions, Task, prepare, with_
 from sitl.hard_fields import Condition, condition_of, laid_out
 from sitl.knowledge import perfect_setup, with_sprayer
 from sitl.motor_parts import ranges_us
-from sitl.outputs import WIRE_S
+from sitl.outputs import SERVO_FRAME_S, WIRE_S
 from sitl.own_method import MakeController, load_controller
 from sitl.profile import load_profile
 from sitl.valve_calibration import (

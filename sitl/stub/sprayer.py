@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.errors import ConfigError
-from sitl.board import SERVO_FRAME_S, DriverBoard
 from sitl.drives import Motors
 from sitl.liquid_faults import LiquidFault, LiquidFaultKind, LiquidSensors
+from sitl.outputs import SERVO_FRAME_S, DriverBoard
 from sitl.plants import edge_plant
 from sitl.profile import FlowLaw, load_profile
 from sitl.stub.outputs import ServoOrder

@@ -22,7 +22,7 @@ import shapely
 
 from companion.config import load
 from companion.core.frame import LocalFrame
-from sitl.board import DriverBoard
+from sitl.outputs import DriverBoard
 from sitl.profile import load_profile
 from tests.companion.wire_peer import WirePeer, free_port, over_udp
 from tests.lua_bindings import FakeAutopilot

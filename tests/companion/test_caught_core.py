@@ -26,7 +26,7 @@ from companion.core.types import (
     VehicleState,
 )
 from companion.output.pwm import RESTART_DUTY
-from sitl.board import SERVO_FRAME_S
+from sitl.outputs import SERVO_FRAME_S
 from tests import builders
 from tests.builders import CURVE, LAG, SPRAYING, setup
 

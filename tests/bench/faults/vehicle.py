@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from sitl.board import DriverBoard
+from sitl.outputs import DriverBoard
 from sitl.profile import load_profile
 from sitl.stub.build import StubOptions, build_autopilot
 from sitl.stub.mission_items import AUTO, Phase
