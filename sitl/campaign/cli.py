@@ -235,8 +235,15 @@ def show(
 
     Exit 0: shown; 2: the folder or an option is wrong.
     """
-    from sitl.campaign.sensitivity import notes_of, sensitivity_lines, sensitivity_of
-    from sitl.campaign.show import SHOWN, groups_of, lines_of, read_rows
+    from sitl.campaign.show import (
+        SHOWN,
+        groups_of,
+        lines_of,
+        notes_of,
+        read_rows,
+        sensitivity_lines,
+        sensitivity_of,
+    )
     from sitl.campaign.show import as_json as shown_json
 
     rows = read_rows(folder, tuple(dict.fromkeys(figure or SHOWN)))

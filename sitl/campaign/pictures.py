@@ -11,8 +11,7 @@ import numpy as np
 
 from companion.errors import ConfigError
 from companion.wording import install_command
-from sitl.campaign.sensitivity import Index
-from sitl.campaign.show import CONFIDENCE, Floats, Group, Rows, shown_value
+from sitl.campaign.show import CONFIDENCE, Floats, Group, Index, Rows, shown_value
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

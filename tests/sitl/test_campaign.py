@@ -32,8 +32,7 @@ from sitl.campaign.design import Campaign, read_campaign
 from sitl.campaign.executors import pool_of
 from sitl.campaign.flying import fly_flight
 from sitl.campaign.running import LOST, Tally, fly_missing
-from sitl.campaign.sensitivity import notes_of, sensitivity_lines, sensitivity_of
-from sitl.campaign.show import groups_of, read_rows
+from sitl.campaign.show import groups_of, notes_of, read_rows, sensitivity_lines, sensitivity_of
 from sitl.flight import FlightOptions, fly
 from sitl.profile import PROFILES, load_profile
 from tests.sitl.campaign_files import files_of, fly_here, opened, write_campaign
