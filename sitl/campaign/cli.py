@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from sitl.campaign.bundle import Bundle
     from sitl.campaign.dataset import Dataset
     from sitl.campaign.design import Campaign
-    from sitl.campaign.executors import Workers
-    from sitl.campaign.running import Tally
+    from sitl.campaign.running import Tally, Workers
 
 # Without a terminal: how often it says how far it is.
 SAY_EVERY_S = 60.0
@@ -113,7 +112,7 @@ def run(
 
 @contextmanager
 def _workers(count: int | None, cluster: str | None, bundle: Bundle) -> Iterator[Workers]:
-    from sitl.campaign.executors import cluster_at, pool_of
+    from sitl.campaign.running import cluster_at, pool_of
 
     if cluster is None:
         with pool_of(count, bundle) as pool:

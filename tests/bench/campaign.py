@@ -26,8 +26,7 @@ import pyarrow.parquet as pq
 from sitl.campaign.bundle import bundle_of
 from sitl.campaign.dataset import open_dataset, read_columns
 from sitl.campaign.design import read_campaign
-from sitl.campaign.executors import pool_of
-from sitl.campaign.running import Tally, fly_missing
+from sitl.campaign.running import Tally, fly_missing, pool_of
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "measurements" / "scale.md"
 FIELD = """

@@ -21,9 +21,8 @@ from sitl.anyang import EXAMPLE, demo_trajectory
 from sitl.campaign.bundle import Bundle, bundle_of, unpack
 from sitl.campaign.dataset import open_dataset, read_columns
 from sitl.campaign.design import Campaign, read_campaign
-from sitl.campaign.executors import Done, Workers, pool_of
 from sitl.campaign.flying import figures_of
-from sitl.campaign.running import Tally, fly_missing
+from sitl.campaign.running import Done, Tally, Workers, fly_missing, pool_of
 from sitl.flight import FlightOptions, fly
 from sitl.hard_fields import CONDITIONS, condition_of, laid_out
 from sitl.profile import load_profile

@@ -25,13 +25,12 @@ from analysis.evaluation import evaluate
 from companion.cli.app import execute
 from companion.errors import ConfigError
 from sitl.anyang import demo_lags, demo_setup, demo_trajectory
-from sitl.campaign import cli, executors, pictures
+from sitl.campaign import cli, pictures, running
 from sitl.campaign.bundle import program_files
 from sitl.campaign.dataset import part_size
 from sitl.campaign.design import Campaign, read_campaign
-from sitl.campaign.executors import pool_of
 from sitl.campaign.flying import fly_flight
-from sitl.campaign.running import LOST, Tally, fly_missing
+from sitl.campaign.running import LOST, Tally, fly_missing, pool_of
 from sitl.campaign.show import groups_of, notes_of, read_rows, sensitivity_lines, sensitivity_of
 from sitl.flight import FlightOptions, fly
 from sitl.profile import PROFILES, load_profile
@@ -125,7 +124,7 @@ def test_a_worker_that_is_killed_costs_no_row(here: Path, reference: Path, tmp_p
 DIES = """
 import os, signal, sys
 from pathlib import Path
-from sitl.campaign.executors import pool_of
+from sitl.campaign.running import pool_of
 from sitl.campaign.running import Tally, fly_missing
 from tests.sitl.campaign_files import opened
 
@@ -225,12 +224,12 @@ def test_a_flight_without_an_end_is_a_row_in_whatever_thread_it_is(
 
 
 def test_the_bound_of_a_flight_ends_with_it() -> None:
-    with executors._bounded(0.2):
+    with running._bounded(0.2):
         pass
     until_s = process_time() + 0.5
     while process_time() < until_s:  # nothing is raised here any more
         pass
-    assert not [each for each in threading.enumerate() if each.name == executors.WATCH]
+    assert not [each for each in threading.enumerate() if each.name == running.WATCH]
 
 
 ENDLESS = """
