@@ -34,7 +34,6 @@ from sitl.serve_mission import (
     waiting_place,
 )
 from sitl.stub.autopilot import Autopilot
-from sitl.stub.build import StubOptions, TruthLog, build_autopilot, firmware_of
 from sitl.stub.firmware import Firmware
 from sitl.stub.mission_items import AUTO, LAND, LOITER, MissionItem, Phase
 from sitl.stub.parameters import OUTPUT_COUNT
@@ -51,7 +50,7 @@ from sitl.stub.protocol import (
 )
 from sitl.stub.px4 import px4_parameters
 from sitl.stub.scenario import Scenario, load_scenario
-from sitl.stub.server import StubServer
+from sitl.stub.server import StubOptions, StubServer, TruthLog, build_autopilot, firmware_of
 from sitl.stub.sprayer import TAKE_OFF, BoardKind, LiquidOptions, Sprayer, SprayerOptions, words_of
 from sitl.vehicle import Corners
 

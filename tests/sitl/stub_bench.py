@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from sitl.earth import Earth
-from sitl.stub.build import StubOptions, build_autopilot
 from sitl.stub.mission_items import MissionItem, waypoint
 from sitl.stub.outputs import ServoOrder
 from sitl.stub.protocol import Listener, Speaker, dialect
+from sitl.stub.server import StubOptions, build_autopilot
 
 HOME = Earth(latitude_deg=36.0, longitude_deg=114.5)
 STEP_S = 0.02

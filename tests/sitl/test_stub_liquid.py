@@ -13,10 +13,10 @@ from companion.errors import ConfigError
 from companion.sensors.voltage import CurrentLoop, IioVoltage
 from sitl.liquid_faults import LiquidFaultKind, healthy_kpa
 from sitl.serve import ServeOptions, serve
-from sitl.stub.build import StubOptions, build_autopilot
 from sitl.stub.outputs import ServoOrder
 from sitl.stub.protocol import dialect
 from sitl.stub.scenario import load_scenario
+from sitl.stub.server import StubOptions, build_autopilot
 from sitl.stub.sprayer import FLIGHT_BATTERY, LiquidEntry, LiquidOptions, Sprayer, SprayerOptions
 from tests.sitl.stub_bench import HOME
 

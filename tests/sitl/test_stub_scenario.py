@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 from companion.errors import ConfigError
 from sitl.cli import app
 from sitl.serve import ServeOptions, serve
-from sitl.stub.build import StubOptions, build_autopilot, firmware_of, noise_of
 from sitl.stub.faults import FaultKind
 from sitl.stub.scenario import Scenario, load_scenario
+from sitl.stub.server import StubOptions, build_autopilot, firmware_of, noise_of
 from tests.sitl.stub_bench import HOME
 
 EVERYTHING = """

@@ -10,7 +10,6 @@ from collections.abc import Callable
 
 from sitl.outputs import DriverBoard
 from sitl.profile import load_profile
-from sitl.stub.build import StubOptions, build_autopilot
 from sitl.stub.mission_items import AUTO, Phase
 from sitl.stub.outputs import ServoOrder
 from sitl.stub.protocol import (
@@ -23,7 +22,7 @@ from sitl.stub.protocol import (
     Speaker,
     dialect,
 )
-from sitl.stub.server import StubServer
+from sitl.stub.server import StubOptions, StubServer, build_autopilot
 from sitl.stub.world import Rest
 from tests.bench.faults.cases import LinkKind, Output
 from tests.bench.faults.levels import Pulse, openings_of_pulses

@@ -25,9 +25,8 @@ import shapely
 from companion.config import load
 from missions.maps.compiling import compiled_setup
 from sitl.serve import judge
-from sitl.stub.build import StubOptions, TruthLog, build_autopilot
 from sitl.stub.mission_items import MissionItem
-from sitl.stub.server import StubServer
+from sitl.stub.server import StubOptions, StubServer, TruthLog, build_autopilot
 from sitl.stub.sprayer import Sprayer, SprayerOptions
 from sitl.stub.world import ARDUPILOT_NOISE, PX4_NOISE
 from tests.companion.realtime.udp_router import udp_router

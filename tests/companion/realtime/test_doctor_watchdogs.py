@@ -11,9 +11,8 @@ from typing import Any
 import pytest
 
 from sitl.stub.autopilot import Autopilot
-from sitl.stub.build import StubOptions, build_autopilot
 from sitl.stub.outputs import ServoOrder
-from sitl.stub.server import StubServer
+from sitl.stub.server import StubOptions, StubServer, build_autopilot
 from tests.companion.realtime.doctor_bench import guided
 from tests.companion.realtime.ground_bench import example
 from tests.companion.wire_peer import free_port

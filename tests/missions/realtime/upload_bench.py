@@ -14,8 +14,7 @@ from missions.field import build_field
 from missions.files.write import write_plan
 from missions.plan import Settings
 from missions.planner import plan_mission
-from sitl.stub.build import StubOptions, build_autopilot
-from sitl.stub.server import StubServer
+from sitl.stub.server import StubOptions, StubServer, build_autopilot
 from tests.bench.missions import FRAME, to_degrees
 from tests.companion.wire_peer import free_port
 from tests.sitl.stub_bench import HOME

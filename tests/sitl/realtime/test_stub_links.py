@@ -11,9 +11,8 @@ from typing import Any
 import pytest
 
 from companion.errors import LinkError
-from sitl.stub.build import StubOptions, build_autopilot
 from sitl.stub.protocol import Listener, Speaker, dialect
-from sitl.stub.server import StubServer
+from sitl.stub.server import StubOptions, StubServer, build_autopilot
 from tests.companion.wire_peer import free_port
 from tests.sitl.stub_bench import HOME
 

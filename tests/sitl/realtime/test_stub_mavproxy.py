@@ -13,9 +13,8 @@ from pathlib import Path
 import pytest
 
 from sitl.stub.autopilot import Autopilot
-from sitl.stub.build import StubOptions, build_autopilot
 from sitl.stub.mission_items import AUTO, Phase
-from sitl.stub.server import StubServer
+from sitl.stub.server import StubOptions, StubServer, build_autopilot
 from tests.companion.realtime.other_clients import (
     TO_AUTO,
     Console,

@@ -10,9 +10,8 @@ from typing import Any
 
 import pytest
 
-from sitl.stub.build import StubOptions, build_autopilot
 from sitl.stub.mission_items import AUTO, Phase
-from sitl.stub.server import StubServer
+from sitl.stub.server import StubOptions, StubServer, build_autopilot
 from tests.companion.realtime.other_clients import raw_items
 from tests.companion.wire_peer import free_port
 from tests.sitl.stub_bench import HOME, mission, of_firmware
