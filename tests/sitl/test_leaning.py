@@ -15,7 +15,7 @@ from companion.link.codec import Codec
 from sitl.stub.firmware import Autopilot
 from sitl.stub.streams import attitude, highres_imu, scaled_imu
 from sitl.trajectory import Truth
-from sitl.vehicle import DRAG_1_S, GRAVITY_M_S2, MEAN_S, Leaning, leaning
+from sitl.vehicle import AIR_DRAG_1_S, GRAVITY_M_S2, MEAN_S, Leaning, leaning
 
 HEADING_DEG = 130.0
 EAST_M_S2, NORTH_M_S2 = 1.8, -0.7
@@ -55,7 +55,7 @@ def test_at_rest_it_is_level_and_feels_one_g_upwards() -> None:
 def test_at_a_steady_speed_it_leans_forward_against_the_air() -> None:
     found = leaning(moving(0.0, heading_deg=143.13), moving(0.0, heading_deg=143.13), MEAN_S)
     assert math.degrees(found.pitch_rad) == pytest.approx(
-        -math.degrees(math.atan(DRAG_1_S * 5.0 / GRAVITY_M_S2)), abs=1e-3
+        -math.degrees(math.atan(AIR_DRAG_1_S * 5.0 / GRAVITY_M_S2)), abs=1e-3
     )
     assert found.felt_m_s2[0] < 0.0  # the drag
 
