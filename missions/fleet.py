@@ -14,13 +14,14 @@ from itertools import pairwise
 import numpy as np
 
 from missions.demand import Demand
+from missions.depots import DepotChoice
 from missions.errors import PlanError
 from missions.field import Field
 from missions.free_space import free_space
 from missions.paced import Paced
 from missions.plan import Settings, Sortie
 from missions.strips import Floats, axes, directions, lengths_m
-from missions.ways import Ways, build_ways, suggested_depot
+from missions.ways import Ways, build_ways
 
 # A line that is cut shorter than this stays whole, in the share of its middle.
 PART_MIN_M = 2.0
@@ -60,7 +61,7 @@ def fleet_sorties(
     middle = (lines[:, :2] + lines[:, 2:]) / 2.0 @ across
     share = np.searchsorted(borders, middle)
     is_seam = np.append(seams, np.inf)[share] < middle
-    places = _depots(field, lines, demand, share, depots, across, settings.aircraft)
+    places = _depots(field, lines, demand, share, depots, across, settings)
     all_places = np.unique(np.concatenate(places), axis=0) if not len(depots) else depots
     sorties: list[Sortie] = []
     misses = []
@@ -151,9 +152,10 @@ def _depots(
     share: np.ndarray[tuple[int, ...], np.dtype[np.int64]],
     depots: Floats,
     across: Floats,
-    count: int,
+    settings: Settings,
 ) -> list[Floats]:
     """Return the depots of each aircraft."""
+    count = settings.aircraft
     if len(depots) == count:
         order = np.argsort(depots @ across, kind="stable")
         return [depots[[at]] for at in order]
@@ -164,7 +166,10 @@ def _depots(
     for aircraft in range(count):
         some = np.flatnonzero(share == aircraft)
         litres = np.array([demand[at].total_l for at in some])
-        found.append(suggested_depot(field, lines[some], litres, inside))
+        choice = DepotChoice(
+            field=field, lines=lines[some], litres=litres, inside=inside, settings=settings
+        )
+        found.append(choice.ways().depots)
     return found
 
 

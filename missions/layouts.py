@@ -43,7 +43,7 @@ from missions.strips import (
     whole,
 )
 from missions.worth import LEFT_SHARE as WORTH_LEFT
-from missions.worth import LINES_MAX, WORTH, Tour, tour_of, without_stubs, worthwhile
+from missions.worth import LINES_MAX, WORTH, Crowded, Tour, tour_of, without_stubs, worthwhile
 
 # Of the best courses so many are drawn in full; of the layouts so many are gone through line by
 # line, and only the best one where it has more lines than this.
@@ -229,6 +229,17 @@ def flyable(lines: Floats, field: Field, settings: Settings) -> Floats:
         reachable(field.spray, settings.swath_width_m),
         boom_of(settings, field),
         left_share=_spare(field, settings),
+    )
+
+
+def crowded(lines: Floats, field: Field, settings: Settings, *, apart: bool) -> Crowded:
+    """Return the lines, short ones of which may be left out where they crowd waypoints."""
+    return Crowded(
+        lines,
+        reachable(field.spray, settings.swath_width_m),
+        boom_of(settings, field),
+        left_share=_spare(field, settings),
+        apart=apart,
     )
 
 

@@ -18,13 +18,14 @@ from missions.boom import Boom, boom_of, over_warnings
 from missions.corners import Motion
 from missions.coverage import measure, narrow_patches, narrow_warnings, of_rated_ground
 from missions.demand import M2_PER_HA, Demand, Rates, demands, valve_places
+from missions.depots import DEPOTS_MAX, DepotChoice
 from missions.errors import OutOfReachError, PlanError
 from missions.field import Field, local_points
 from missions.files.fence import Fences
 from missions.files.items import ITEMS_MAX, count_of, stops_of
 from missions.fleet import fleet_sorties
 from missions.free_space import free_space
-from missions.layouts import flyable, is_small, spray_lines
+from missions.layouts import crowded, flyable, is_small, spray_lines
 from missions.paced import Paced, in_room, range_warnings, room_warnings
 from missions.plan import Leg, Plan, Settings, Sortie, flown_lines, nose_s, sortie_wh
 from missions.remaining import Remaining, UntreatedRates, demands_once
@@ -47,13 +48,10 @@ from missions.strips import (
     whole,
 )
 from missions.surroundings import NOTHING_AROUND, Pacing, Surroundings
-from missions.ways import Ways, build_ways, edge_places, far_warnings, suggested_depot
+from missions.ways import Ways, build_ways, edge_places, far_warnings
 
 # One sortie may begin and end anywhere: its depot is chosen among so many places of the edge.
 EDGE_STEP_M, EDGE_PLACES = 25.0, 24
-# Where the battery does not reach everything from one depot, more are suggested, so many at most;
-# flights to places farther than this part of what it reaches spray little.
-DEPOTS_MAX, REACH = 6, 0.8
 
 
 class One(Protocol):
@@ -123,6 +121,7 @@ def _planned(
     if not sum(need.total_l for need in demand) > 0.0:
         raise PlanError("nothing of the field has a rate above zero; check the prescription")
     given = _depots(field.frame, depots)
+    crowding = crowded(lines, field, settings, apart=with_sprayer) if left is None else None
     lines_are_drawn()
 
     def one(some: Floats, needs: list[Demand], ways: Ways, *, any_depot: bool = False) -> Paced:
@@ -136,13 +135,20 @@ def _planned(
             )
             return count_of(stops, settings, with_sprayer=with_sprayer)
 
+        share = float(lengths_m(some).sum() / lengths_m(lines).sum())
+
         def pace(
             sorties: Sequence[Sortie], fenced: Callable[[Sortie], bool] | None = None
         ) -> Paced:
-            return in_room(
-                sorties, ways, pacing.paced, count,
+            bare = partial(
+                in_room, ways=ways, pace=pacing.paced, items=count,
                 room=ITEMS_MAX[settings.autopilot], fenced=fenced,
             )  # fmt: skip
+            return (
+                bare(sorties)
+                if crowding is None
+                else crowding.paced(sorties, bare, ways, share=share)
+            )
 
         around.check(field, ways.depots)
         return flown(
@@ -157,6 +163,8 @@ def _planned(
         sorties, places = fleet.paced, fleet.depots
     else:
         sorties, places = _from_depots(field, lines, demand, settings, given, one)
+    if crowding is not None:
+        lines = sprayed = crowding.flown(sorties.sorties)
     done = no_lines() if left is None else left.done
     covered = measure(sprayed, field.limit, width_m, strips=boom.strips(sprayed))
     strips = boom.strips(joined([done, flown_lines(sorties.sorties)]))
@@ -206,38 +214,17 @@ def _from_depots(
         used = sorted({sortie.depot for sortie in found.sorties})
         sorties = [replace(each, depot=used.index(each.depot)) for each in found.sorties]
         return replace(found, sorties=tuple(sorties)), edge[used]
-    ways = _in_reach(field, lines, litres, REACH * settings.reach_m)
+    choice = DepotChoice(
+        field=field, lines=lines, litres=litres, inside=free_space(field.fly), settings=settings
+    )
+    ways = choice.ways()
     while True:
         try:
             return one(lines, demand, ways), ways.depots
         except OutOfReachError:
             if len(ways.depots) >= DEPOTS_MAX:
                 raise
-        ways = _with_another(ways, lines, litres)
-
-
-def _in_reach(field: Field, lines: Floats, litres: Floats, reach_m: float) -> Ways:
-    """Return the ways from the best depot, and from more where it is too far from some line."""
-    inside = free_space(field.fly)
-    ways = build_ways(field, suggested_depot(field, lines, litres, inside), inside)
-    ends = lines.reshape(-1, 2)
-    home_m = ways.home_ways_m(ends)
-    while float(home_m.min(axis=0).max()) > reach_m and len(ways.depots) < DEPOTS_MAX:
-        ways = _with_another(ways, lines, litres)
-        home_m = ways.home_ways_m(ends)
-    needed = list(range(len(ways.depots)))
-    for depot in needed[:-1]:
-        others = [each for each in needed if each != depot]
-        if float(home_m[others].min(axis=0).max()) <= reach_m:
-            needed = others
-    if len(needed) == len(ways.depots):
-        return ways
-    return build_ways(field, ways.depots[needed], inside)
-
-
-def _with_another(ways: Ways, lines: Floats, litres: Floats) -> Ways:
-    another = suggested_depot(ways.field, lines, litres, ways.inside, besides=ways)
-    return build_ways(ways.field, np.concatenate([ways.depots, another]), ways.inside)
+        ways = choice.ways(len(ways.depots) + 1)
 
 
 def _of_its_size(settings: Settings, field: Field) -> Settings:

@@ -26,8 +26,6 @@ AROUND_M = 50.0
 # A depot this close to the field stands on its edge.
 ON_EDGE_M = 0.05
 DEPOT_FAR_M = 20_000.0
-# Of a field that does not see all of itself so many places stand for the lines.
-SOME_POINTS = 150
 # Of so many ends at once ways around corners are looked at: the tables on the way stay small.
 ENDS_TOGETHER = 512
 # A depot farther from the field than this is worth a word: each flight is mostly ferry.
@@ -239,31 +237,7 @@ def edge_places(field: Field, *, step_m: float, count_max: int) -> Floats:
     return outer
 
 
-def suggested_depot(
-    field: Field, lines: Floats, litres: Floats, inside: FreeSpace, *, besides: Ways | None = None
-) -> Floats:
-    """Return the place on the edge of the field from which the litres are nearest, shape (1, 2).
-
-    Near is what is flown inside the field, around its bays and obstacles. With `besides` it is one
-    more depot: of each litre counts the nearer of the two ways.
-    """
-    places = edge_places(field, step_m=25.0, count_max=120 if inside.is_convex else 60)
-    middle = (lines[:, :2] + lines[:, 2:]) / 2.0
-    thirds = np.stack([(lines[:, :2] + middle) / 2, middle, (lines[:, 2:] + middle) / 2], axis=1)
-    points, weight = thirds.reshape(-1, 2), np.repeat(np.maximum(litres, 1e-9), 3)
-    if not inside.is_convex:
-        # Lines in a row lie beside each other: one of them stands for some.
-        some = np.array_split(np.arange(len(points)), min(len(points), SOME_POINTS))
-        weight = np.array([weight[group].sum() for group in some])
-        points = points[[group[len(group) // 2] for group in some]]
-    far_m = _ways_m(places, points, inside)
-    if besides is not None:
-        far_m = np.minimum(far_m, besides.home_ways_m(points).min(axis=0))
-    best: Floats = places[[int(np.argmin(far_m @ weight))]]
-    return best
-
-
-def _ways_m(places: Floats, points: Floats, inside: FreeSpace) -> Floats:
+def ways_m(places: Floats, points: Floats, inside: FreeSpace) -> Floats:
     """Return how long the ways from places to points are, over a few corners near to them."""
     far_m: Floats = np.hypot(*(places[:, None, :] - points[None, :, :]).transpose(2, 0, 1))
     if inside.is_convex:

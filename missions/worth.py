@@ -7,7 +7,9 @@ elsewhere. A plan may leave out a little; where that saves most, is decided here
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import shapely
@@ -18,9 +20,13 @@ from missions.corners import Motion
 from missions.demand import Pieces
 from missions.free_space import FreeSpace
 from missions.network import JOIN_M, Network, build_network
-from missions.stops import NEAR_M
-from missions.strips import LINE_MIN_M, Floats, Objects, directions, lengths_m, whole
+from missions.paced import Paced
+from missions.plan import Leg
+from missions.plan import Sortie as FlownSortie
+from missions.stops import NEAR_M, near_pairs, waypoints_of
+from missions.strips import LINE_MIN_M, Bools, Floats, Objects, directions, lengths_m, whole
 from missions.tour import Ring, Sortie, by_savings, cost_s, one_chain, shortest_tour
+from missions.ways import Ways
 
 # A plan covers 99.9 % of what a strip can reach; all that is left out together stays below this.
 LEFT_SHARE = 0.00085
@@ -97,6 +103,126 @@ def without_stubs(
             ground.kept[at] = False
             spare_m2 -= lost_m2
     return lines[ground.kept]
+
+
+class Crowded:
+    """Lines too short for a leg at waypoints that are too near to each other: some are left out.
+
+    The ground that they alone cover comes out of what a plan may leave, as far as that goes.
+    """
+
+    def __init__(
+        self, lines: Floats, target: BaseGeometry, boom: Boom, *, left_share: float, apart: bool
+    ) -> None:
+        self._lines = lines
+        self._target = target
+        self._boom = boom
+        self._left_share = left_share
+        self._apart = apart
+        self._left_out: set[int] = set()
+
+    def paced(
+        self,
+        sorties: Sequence[FlownSortie],
+        pace: Callable[[Sequence[FlownSortie]], Paced],
+        ways: Ways,
+        *,
+        share: float,
+    ) -> Paced:
+        """Return the sorties as `pace` does, without short lines where waypoints stay too near.
+
+        They are this share of all lines, and may leave so much of what all may.
+        """
+        found = pace(sorties)
+        places = self._near(found)
+        if not len(places):
+            return found
+        spare_m2, given, tried = share * self._spare_m2, list(sorties), 0
+        for at, sortie in enumerate(given):
+            for line in self._beside(sortie, places)[: TRIED_MAX - tried]:
+                tried += 1
+                lost_m2 = self._ground.alone_m2(line)
+                fewer = _without(sortie, self._lines[line], ways)
+                if lost_m2 > spare_m2 or fewer is None:
+                    continue
+                if len(self._near(pace([fewer]))) < len(self._near(pace([sortie]))):
+                    spare_m2 -= lost_m2
+                    self._ground.kept[line] = False
+                    self._left_out.add(line)
+                    given[at] = sortie = fewer
+        # The next sorties may fly them.
+        self._ground.kept[:] = True
+        return pace(given)
+
+    def flown(self, sorties: Sequence[FlownSortie]) -> Floats:
+        """Return the lines without those that were left out and none of these sorties flies."""
+        legs = [leg for each in sorties for leg in each.legs if leg.kind == "spray"]
+        unflown = [
+            at
+            for at in self._left_out
+            if not any(_is_line(self._lines[[at]], leg).any() for leg in legs)
+        ]
+        found: Floats = np.delete(self._lines, unflown, axis=0)
+        return found
+
+    @cached_property
+    def _ground(self) -> _Ground:
+        return _Ground(self._lines, self._target, self._boom)
+
+    @cached_property
+    def _spare_m2(self) -> float:
+        left_m2 = self._target.difference(self._boom.united(self._lines)).area
+        return self._left_share * self._target.area - float(left_m2)
+
+    def _near(self, found: Paced) -> Floats:
+        """Return the places of waypoints that are too near to the one before, and of those."""
+        pairs = [
+            pair
+            for sortie in found.sorties
+            for pair in near_pairs(waypoints_of(sortie, apart=self._apart))
+        ]
+        return np.array(pairs).reshape(-1, 2)
+
+    def _beside(self, sortie: FlownSortie, places: Floats) -> list[int]:
+        """Return the short lines of a sortie beside these places, those of least ground first."""
+        legs = [leg for leg in sortie.legs if leg.kind == "spray" and leg.length_m < NEAR_M]
+        found = set()
+        for leg in legs:
+            ends = np.array(leg.points)
+            if np.hypot(*(ends[:, None] - places[None]).transpose(2, 0, 1)).min() < NEAR_M:
+                found |= {int(at) for at in np.flatnonzero(_is_line(self._lines, leg))}
+        return sorted(found, key=self._ground.alone_m2)
+
+
+def _is_line(lines: Floats, leg: Leg) -> Bools:
+    """Return which of the lines a leg is, flown from either end."""
+    row = np.array([*leg.points[0], *leg.points[-1]])
+    either = [np.abs(lines - each).max(axis=1) for each in (row, np.roll(row, 2))]
+    found: Bools = np.minimum(*either) < SAME_M
+    return found
+
+
+def _without(sortie: FlownSortie, line: Floats, ways: Ways) -> FlownSortie | None:
+    """Return a sortie without one of its lines; None where it has no other."""
+    legs = sortie.legs
+    (at,) = [
+        number
+        for number, leg in enumerate(legs)
+        if leg.kind == "spray" and _is_line(line[None], leg).any()
+    ]
+    before, after = legs[at - 1], legs[at + 1]
+    if len(legs) < 5:
+        return None
+    start, end = before.points[0], after.points[-1]
+    if at == 1:
+        way, kind = ways.home(sortie.depot, end), before.kind
+    elif at == len(legs) - 2:
+        way, kind = ways.home(sortie.depot, start)[::-1], after.kind
+    else:
+        way, leaves = ways.between(start, end)
+        kind = "ferry" if leaves else "transit"
+    joined_way = replace(before, kind=kind, points=tuple(way), through=False)
+    return replace(sortie, legs=(*legs[: at - 1], joined_way, *legs[at + 2 :]))
 
 
 def _change_s(ring: Ring, piece: int) -> float:

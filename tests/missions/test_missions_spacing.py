@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -13,12 +15,14 @@ from shapely import LineString, Point, box
 from missions.boom import Boom
 from missions.demand import Uniform
 from missions.field import build_field
+from missions.paced import Paced
 from missions.plan import Leg, Place, Plan, Settings, Sortie
 from missions.planner import plan_mission
 from missions.spacing import Spacing
 from missions.stops import NEAR_M, near_pairs, near_warnings, timed, waypoints_of
+from missions.strips import rectangles
 from missions.ways import build_ways
-from missions.worth import without_stubs
+from missions.worth import Crowded, without_stubs
 from tests.bench.missions import FRAME, to_degrees
 from tests.mission_fields import trees
 from tests.mission_flight import Way, flown_s
@@ -213,6 +217,48 @@ def test_where_there_is_no_room_it_is_counted_and_said() -> None:
     assert len(near_pairs(waypoints_of(found))) == 3
     (said,) = near_warnings([found], FRAME)
     assert "3 waypoints less than 2 m from the one before, the nearest 0.8 m near" in said
+
+
+# A corridor of 1.8 m with lines across its ends: the second one stands 1.4 m behind the first.
+ROOM = box(0.0, 0.0, 1.8, 40.0)
+SHORT = ((1.5, 20.0), (0.3, 20.0))
+LONG = (((0.9, 1.0), (0.9, 19.0)), ((0.9, 21.0), (0.9, 39.0)))
+
+
+def crowded_of(lines: list[Line], *, left_share: float) -> Crowded:
+    rows = np.array([[*start, *end] for start, end in lines])
+    target = rectangles(rows, 1.0)
+    return Crowded(
+        rows, shapely.union_all(target), Boom(width_m=1.0), left_share=left_share, apart=False
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_a_line_of_a_metre_among_waypoints_too_near_is_left_out_where_it_may_be(
+    number: int,
+) -> None:
+    lines: list[Line] = [*LONG]
+    lines.insert(number, SHORT)
+    sortie = sortie_of(*lines)
+    spacing = spacing_of(ROOM, settings=replace(SETTINGS, swath_width_m=1.0))
+
+    def pace(sorties: Sequence[Sortie]) -> Paced:
+        return Paced(sorties=spacing.spaced(sorties), misses=())
+
+    assert near_pairs(waypoints_of(pace([sortie]).sorties[0]))
+    crowded = crowded_of(lines, left_share=0.05)
+    found = crowded.paced([sortie], pace, spacing.ways, share=1.0)
+    assert not near_pairs(waypoints_of(found.sorties[0]))
+    assert found.sorties[0].lines == 2
+    assert len(crowded.flown(found.sorties)) == 2
+    ways = [leg.points for leg in found.sorties[0].legs]
+    assert all(math.dist(one[-1], other[0]) < 1e-6 for one, other in pairwise(ways))
+    # Where its ground may not be left, or that is the share of other lines, it is flown.
+    for left_share, share in ((0.01, 1.0), (0.05, 0.1)):
+        crowded = crowded_of(lines, left_share=left_share)
+        kept = crowded.paced([sortie], pace, spacing.ways, share=share)
+        assert kept == pace([sortie])
+        assert len(crowded.flown(kept.sorties)) == 3
 
 
 @pytest.mark.parametrize("words", ["plain", "ferry height", "px4"])
