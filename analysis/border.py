@@ -21,8 +21,8 @@ from analysis.track import TOUCH_M, Bools, Floats, Ints, Track
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from analysis.flight_record import Orders
     from companion.core.prescription import Prescription
-    from companion.core.types import TimedChange
 
 # Flow has ended below this part of what it was.
 ENDED_BELOW = 0.02
@@ -92,14 +92,11 @@ def border_crossings(strip: Strip, prescription: Prescription) -> list[BorderCro
     return found
 
 
-def _switches(orders: Sequence[TimedChange]) -> list[tuple[float, bool]]:
+def _switches(orders: Orders) -> list[tuple[float, bool]]:
     """Return when a valve was ordered to open (True) or to close."""
-    found: list[tuple[float, bool]] = []
-    for order in orders:
-        is_open = order.duty > 0.0
-        if is_open != (found[-1][1] if found else False):
-            found.append((order.at_s, is_open))
-    return found
+    is_open = orders.duty > 0.0
+    its = np.flatnonzero(np.diff(is_open, prepend=False))
+    return list(zip(orders.at_s[its].tolist(), is_open[its].tolist(), strict=True))
 
 
 def _delay_s(

@@ -6,13 +6,15 @@ here says where it came from, and nothing here was seen by the controller.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from companion.core.boom import Boom, Valve
+from companion.core.types import TimedChange
 
 if TYPE_CHECKING:
     from companion.core.nozzle import NozzleSet
@@ -20,10 +22,6 @@ if TYPE_CHECKING:
     from companion.core.options.lines import Lines
     from companion.core.options.overlap import OverlapGuard
     from companion.core.prescription import Prescription
-    from companion.core.types import TimedChange
-
-
-from collections.abc import Iterable
 
 # Spans of time: (from, until) in seconds.
 
@@ -65,6 +63,50 @@ class FlightMeta:
     training: str | None = None
 
 
+class Orders(Sequence[TimedChange]):
+    """Changes of duty in order of time, in arrays; each is made when it is asked for.
+
+    A flight has ten thousand: most that is asked of them is asked of all at once.
+    """
+
+    def __init__(self, at_s: Floats, valve: NDArray[np.int64], duty: Floats) -> None:
+        if not (((duty >= 0.0) & (duty <= 1.0)).all() and (np.abs(at_s) < np.inf).all()):
+            raise ValueError("a change has a duty outside [0, 1], or a time that is not finite")
+        if not (valve >= 0).all():
+            raise ValueError("a change has a negative valve index")
+        self.at_s, self.valve, self.duty = at_s, valve, duty
+
+    @classmethod
+    def of(cls, changes: Sequence[TimedChange]) -> Orders:
+        """Return changes in arrays."""
+        if isinstance(changes, Orders):
+            return changes
+        return cls(
+            np.array([each.at_s for each in changes], dtype=np.float64),
+            np.array([each.valve for each in changes], dtype=np.int64),
+            np.array([each.duty for each in changes], dtype=np.float64),
+        )
+
+    def of_valve(self, valve: int) -> Orders:
+        """Return those of one valve."""
+        its = np.flatnonzero(self.valve == valve)
+        return Orders(self.at_s[its], self.valve[its], self.duty[its])
+
+    def __len__(self) -> int:
+        return len(self.at_s)
+
+    @overload
+    def __getitem__(self, index: int) -> TimedChange: ...
+    @overload
+    def __getitem__(self, index: slice) -> Orders: ...
+    def __getitem__(self, index: int | slice) -> TimedChange | Orders:
+        if isinstance(index, slice):
+            return Orders(self.at_s[index], self.valve[index], self.duty[index])
+        return TimedChange(
+            at_s=self.at_s.item(index), valve=self.valve.item(index), duty=self.duty.item(index)
+        )
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightRecord:
     """True path and true volume at even steps of time (2 ms pulsed, 10 ms averaged).
@@ -89,7 +131,7 @@ class FlightRecord:
     boom: Boom
     prescription: Prescription
     pwm_period_s: float
-    orders: tuple[TimedChange, ...]
+    orders: Sequence[TimedChange]
     meta: FlightMeta
     duty_limits: tuple[float, float] = (0.0, 1.0)
     nozzle_sets: tuple[NozzleSet, ...] = ()

@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from analysis.changes import Run
+    from analysis.flight_record import Orders
     from analysis.track import Bools, Floats, Ints, Track
     from analysis.transitions import SmoothTrack
     from companion.core.prescription import Prescription
-    from companion.core.types import TimedChange
 
 # A controller may keep a strip closed whose end comes this near to the border.
 CLEAR_M = 0.2
@@ -64,7 +64,7 @@ def holds_of(
     track: Track,
     prescription: Prescription,
     stretches: Sequence[Run],
-    orders: Sequence[TimedChange],
+    orders: Orders,
     spared: Bools,
 ) -> tuple[Hold, ...]:
     """Return the holds of one valve where something is prescribed; `orders` are that valve's.
@@ -73,8 +73,7 @@ def holds_of(
     """
     if not orders:
         return ()
-    at_s = np.array([order.at_s for order in orders])
-    duty = np.array([order.duty for order in orders])
+    at_s, duty = orders.at_s, orders.duty
     marks_s = track.time_s[track.marks]
     given = np.searchsorted(at_s, marks_s, "right")
     is_closed = closed_by_order(orders, marks_s)

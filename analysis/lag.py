@@ -14,7 +14,6 @@ truth, so that the figures differ by up to half a metre for that reason alone.
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, NamedTuple
@@ -22,6 +21,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from analysis.changes import Change, changes_of
+from analysis.flight_record import Orders
 from analysis.flown.modelled_flow import flow_of, set_in_force
 from analysis.holds import sides_of
 from analysis.track import Bools, Floats, Ints, Track, rise_over
@@ -97,7 +97,7 @@ class _Lines(NamedTuple):
 def measure_steps(
     track: Track,
     stretches: Sequence[Run],
-    orders: Sequence[TimedChange],
+    orders: Orders,
     duty_limits: tuple[float, float],
     holds: Sequence[Hold] = (),
 ) -> list[Step]:
@@ -200,7 +200,7 @@ def _lines(smooth: SmoothTrack, near_s: Floats, far_s: Floats, closed: Bools) ->
 
 
 def _is_saturated(
-    orders: Sequence[TimedChange],
+    orders: Orders,
     duty_limits: tuple[float, float],
     stretch: Run,
     doses_ml_m: Sequence[float],
@@ -211,11 +211,11 @@ def _is_saturated(
     by the flow's own level and needs no limit.
     """
     middle_s = stretch.start_s + 0.5 * stretch.dwell_s
-    number = bisect_right(orders, middle_s, key=lambda order: order.at_s)
+    number = int(np.searchsorted(orders.at_s, middle_s, "right"))
     asked, given = doses_ml_m
     if not number:
         return False
-    duty = orders[number - 1].duty
+    duty = orders.duty.item(number - 1)
     short = duty >= duty_limits[1] and DRY_BELOW < given / asked < 1.0 - SATURATED_ERROR
     over = 0.0 < duty <= duty_limits[0] and given > asked * (1.0 + SATURATED_ERROR)
     return short or over
@@ -419,9 +419,8 @@ def ordered_ml_s(
 
     In force is the smallest set with all valves that are open; each valve gives its share.
     """
-    at_s = np.array([order.at_s for order in orders])
-    valve = np.array([order.valve for order in orders], dtype=np.int64)
-    duty = np.array([order.duty for order in orders])
+    every = Orders.of(orders)
+    at_s, valve, duty = every.at_s, every.valve, every.duty
     by_size = sorted(nozzle_sets, key=lambda each: len(each.valves))
     totals = np.stack([_total_of(nozzles, valve, duty) for nozzles in by_size])
     number = set_in_force(valve, duty, by_size)

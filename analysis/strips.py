@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from analysis.changes import Run, find_runs, stretches_of
+from analysis.flight_record import Orders
 from analysis.track import Bools, Floats, Ints, Track, tracks_of
 from analysis.transitions import ML_M_PER_L_HA_M
 
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
 
     from analysis.flight_record import FlightRecord
     from companion.core.prescription import Prescription
-    from companion.core.types import TimedChange
 
 # Ground is treated in squares of this, looked at in so many metres across a strip, and a valve that
 # gives less than this part of its usual dose treats none.
@@ -33,16 +33,16 @@ SLACK_M = 0.2
 _OFFSET = 2**31
 
 
-def closed_by_order(orders: Sequence[TimedChange], at_s: Floats) -> Bools:
+def closed_by_order(orders: Orders, at_s: Floats) -> Bools:
     """Return at which times a valve is closed by its orders; before the first it is."""
-    duty = np.array([0.0, *(order.duty for order in orders)])
-    given = np.searchsorted(np.array([order.at_s for order in orders]), at_s, "right")
+    duty = np.concatenate(([0.0], orders.duty))
+    given = np.searchsorted(orders.at_s, at_s, "right")
     closed: Bools = ~(duty[given] > 0.0)
     return closed
 
 
 def spared_of(
-    record: FlightRecord, tracks: Sequence[Track], orders: Sequence[Sequence[TimedChange]]
+    record: FlightRecord, tracks: Sequence[Track], orders: Sequence[Orders]
 ) -> list[Bools]:
     """Return for each track, at its marks, whether its valve is spared; nowhere without a guard."""
     guard = record.guard
@@ -143,7 +143,7 @@ class Strip:
     track: Track
     runs: tuple[Run, ...]
     stretches: tuple[Run, ...]
-    orders: tuple[TimedChange, ...]
+    orders: Orders
     whole: Bools
     grazing: Bools
     spared: Bools
@@ -177,10 +177,8 @@ class Strip:
 
 def strips_of(record: FlightRecord) -> list[Strip]:
     """Return the strips of all valves, left to right."""
-    orders: list[list[TimedChange]] = [[] for _ in record.boom.valves]
-    for order in record.orders:
-        if order.valve < len(orders):
-            orders[order.valve].append(order)
+    every = Orders.of(record.orders)
+    orders = [every.of_valve(valve) for valve in range(len(record.boom.valves))]
     tracks = tracks_of(record)
     spared = spared_of(record, tracks, orders)
     return [
@@ -189,7 +187,7 @@ def strips_of(record: FlightRecord) -> list[Strip]:
     ]
 
 
-def _strip(track: Track, record: FlightRecord, orders: list[TimedChange], spared: Bools) -> Strip:
+def _strip(track: Track, record: FlightRecord, orders: Orders, spared: Bools) -> Strip:
     runs = find_runs(track, record.prescription)
     stretches = stretches_of(runs)
     whole, grazing = _inside(track, record.prescription)
@@ -197,7 +195,7 @@ def _strip(track: Track, record: FlightRecord, orders: list[TimedChange], spared
         track=track,
         runs=tuple(runs),
         stretches=tuple(stretches),
-        orders=tuple(orders),
+        orders=orders,
         whole=whole,
         grazing=grazing,
         spared=spared,

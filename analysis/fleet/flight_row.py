@@ -238,7 +238,7 @@ def _evaluated(journal: OpenJournal, setup: Setup, row: Row) -> Row:
     found = {**row, "is_evaluated": True, "evaluated_with": _own_version()}
     unread: list[str] = []
     try:
-        flight = flight_of(journal, setup, unread)
+        flight = flight_of(journal, setup, unread, is_sound=True)
         assessment = essentials_of(flight)
     except (EvaluationError, JournalError, ShapelyError, *DAMAGE) as error:
         # One strange flight is no reason to lose the others.

@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from analysis.flight_record import FlightMeta, FlightRecord
+from analysis.flight_record import FlightMeta, FlightRecord, Orders
 from analysis.flown.holes import with_gaps
 from analysis.flown.modelled_flow import metered, ordered_s, pumped_ml, valve_flows
-from companion.core.types import TimedChange
 from companion.errors import VrsprayError
 
 if TYPE_CHECKING:
@@ -86,19 +85,11 @@ def modelled_ml(flight: AppliedFlight, time_s: Floats) -> Floats:
     return np.stack([flow.volume_ml(time_s) for flow in flows], axis=1)
 
 
-def executed_orders(flight: AppliedFlight) -> tuple[TimedChange, ...]:
+def executed_orders(flight: AppliedFlight) -> Orders:
     """Return the changes as the output carried them out, in order of time."""
     order_s = ordered_s(flight.changes)
     rows = np.argsort(order_s, kind="stable")
-    return tuple(
-        TimedChange(at_s=at_s, valve=valve, duty=duty)
-        for at_s, valve, duty in zip(
-            order_s[rows].tolist(),
-            flight.changes.valve[rows].tolist(),
-            flight.changes.duty[rows].tolist(),
-            strict=True,
-        )
-    )
+    return Orders(order_s[rows], flight.changes.valve[rows], flight.changes.duty[rows])
 
 
 def heading_deg(flight: AppliedFlight, time_s: Floats) -> Floats:

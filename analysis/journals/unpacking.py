@@ -31,7 +31,7 @@ from companion.journal.packing import (
 UNPACKED_MAX = 64_000_000
 _REAL = struct.Struct("<d")
 _LONG = struct.Struct("<q")
-_SIGN = 1 << 63
+SIGN = 1 << 63
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,7 +107,8 @@ class _Column:
 
 
 @lru_cache(maxsize=4096)
-def _pieces_of(form: str) -> tuple[str, ...]:
+def pieces_of(form: str) -> tuple[str, ...]:
+    """Return a form cut at its holes, and these between the pieces."""
     return tuple(HOLE.split(form))
 
 
@@ -117,7 +118,7 @@ def _part(reader: Reader, leader: Part | None) -> Part:
     gaps = [signed(gap) for gap in reader.integers(count)]
     leads, order = reader.integers(count), reader.integers(count)
     columns = _columns(reader, order, [keys_of(form) for form in forms])
-    pieces = [list(_pieces_of(form)) for form in forms]
+    pieces = [list(pieces_of(form)) for form in forms]
     holes = [[columns[key] for key in keys_of(form)] for form in forms]
     part = Part(lines=[], gaps=gaps, seen=[], ends=[])
     heard = told = 0
@@ -190,20 +191,20 @@ def _numbers(columns: Sequence[_Column], seen: list[str]) -> list[str]:
 def _word_of(text: str) -> int:
     """Return a float's bits as an integer in the order of the numbers."""
     word: int = _LONG.unpack(_REAL.pack(float(text)))[0]
-    return word if word >= 0 else -(word & _SIGN - 1) - 1
+    return word if word >= 0 else -(word & SIGN - 1) - 1
 
 
 def _float_of(word: int) -> str:
-    (value,) = _REAL.unpack(_LONG.pack(word if word >= 0 else (-word - 1) - _SIGN))
+    (value,) = _REAL.unpack(_LONG.pack(word if word >= 0 else (-word - 1) - SIGN))
     return repr(value)
 
 
 # Reads the numbers of a packed block: integers of seven bits a byte, floats by differences.
 
-_PLENTY = 0x7F
+PLENTY = 0x7F
 # A float has all decimal numbers of fifteen digits, each by a text of its own.
-_EXACT_MAX = 10**15
-_EXACT_DECIMALS_MAX = 22  # ten to the power of so much is a float without an error
+EXACT_MAX = 10**15
+EXACT_DECIMALS_MAX = 22  # ten to the power of so much is a float without an error
 
 
 class Reader:
@@ -232,18 +233,18 @@ class Reader:
         if count > len(content) - at:
             raise ValueError("a block is cut off")
         found = list(content[at : at + count])
-        if max(found, default=0) <= _PLENTY:
+        if max(found, default=0) <= PLENTY:
             self._at += count
             return found
         found = []
         for _ in range(count):
             value = content[at]
             at += 1
-            if value > _PLENTY:
-                value &= _PLENTY
+            if value > PLENTY:
+                value &= PLENTY
                 shift = 7
-                while content[at] > _PLENTY:
-                    value |= (content[at] & _PLENTY) << shift
+                while content[at] > PLENTY:
+                    value |= (content[at] & PLENTY) << shift
                     shift += 7
                     at += 1
                 value |= content[at] << shift
@@ -285,7 +286,7 @@ def signed(word: int) -> int:
 
 def _unscaled(values: Sequence[int], decimals: int) -> list[str]:
     scale = 10.0**decimals
-    if -_EXACT_MAX < min(values) <= max(values) < _EXACT_MAX and decimals <= _EXACT_DECIMALS_MAX:
+    if -EXACT_MAX < min(values) <= max(values) < EXACT_MAX and decimals <= EXACT_DECIMALS_MAX:
         return [repr(value / scale) for value in values]
     found = []
     for value in values:
@@ -297,13 +298,13 @@ def _unscaled(values: Sequence[int], decimals: int) -> list[str]:
 
 
 def _from_bits(words: Sequence[int]) -> list[str]:
-    raw = [word if word >= 0 else (-word - 1) | _SIGN for word in words]
+    raw = [word if word >= 0 else (-word - 1) | SIGN for word in words]
     packed = struct.pack(f"<{len(raw)}Q", *raw)
     return [repr(value) for value in struct.unpack(f"<{len(raw)}d", packed)]
 
 
 _DECISION = "Decision"
-_SELECT = (
+SELECT = (
     "SELECT first_sequence, from_s, until_s, dictionary, crc32, body, {} FROM blocks "
     "ORDER BY first_sequence"
 )
@@ -334,16 +335,16 @@ def read_blocks(
     """
     with_decisions = kinds is None or _DECISION in kinds
     starts = None if kinds is None else tuple(f'{{"{kind}":' for kind in kinds)
-    dictionaries = _Dictionaries(connection)
-    sql = _SELECT.format("decisions_crc32, decisions" if with_decisions else "NULL, NULL")
+    dictionaries = Dictionaries(connection)
+    sql = SELECT.format("decisions_crc32, decisions" if with_decisions else "NULL, NULL")
     for first, from_s, until_s, dictionary, *parts in connection.execute(sql):
         rows: list[tuple[int, str]] = []
         inputs: Part | None = None
         try:
-            inputs = _checked(parts[0], parts[1], dictionaries.get(dictionary), None)
+            inputs = checked(parts[0], parts[1], dictionaries.get(dictionary), None)
             rows += inputs.rows(first)
             if with_decisions:
-                decisions = _checked(parts[2], parts[3], dictionaries.get(dictionary), inputs)
+                decisions = checked(parts[2], parts[3], dictionaries.get(dictionary), inputs)
                 rows += decisions.rows(first)
                 rows.sort()
         except (ValueError, TypeError, OverflowError) as error:
@@ -357,14 +358,15 @@ def read_blocks(
                 yield Entry(sequence, line[2 : line.find('"', 2)], line)
 
 
-def _checked(crc: int, packed: bytes, dictionary: bytes, leader: Part | None) -> Part:
+def checked(crc: int, packed: bytes, dictionary: bytes, leader: Part | None) -> Part:
+    """Return what is in a packed block; ValueError where its check sum does not fit."""
     part = part_of(inflated(packed, dictionary), leader)
     if zlib.crc32("".join(part.lines).encode("ascii")) != crc:
         raise ValueError("the check sum does not fit")
     return part
 
 
-class _Dictionaries:
+class Dictionaries:
     """The blocks' dictionaries by their numbers, each read once."""
 
     def __init__(self, connection: sqlite3.Connection) -> None:

@@ -20,11 +20,14 @@ from analysis.flown.applied_flight import AppliedFlight
 from analysis.flown.applied_record import record_of
 from analysis.flown.modelled_flow import ordered_s
 from analysis.flown.read_applied import read_applied
+from analysis.flown.sensor_series import sensors_of
 from analysis.journals.content import read_journal
 from analysis.replay import replay
 from companion.cli.app import execute
 from companion.errors import JournalError
+from companion.journal.codec import field_names_of
 from companion.journal.journal import Journal
+from companion.journal.reader import opened
 from sitl.flight import FlightOptions
 from sitl.flight import fly as simulate
 from sitl.fly import FlyOptions, prepare
@@ -136,6 +139,24 @@ def test_a_damaged_journal_is_read_as_far_as_it_goes(flown: Flown, tmp_path: Pat
     assert len(unread) == 1
     assert f"rows from {first}" in unread[0]
     assert len(flight.time_s) == len(flown.flight.time_s)
+
+
+def test_sensors_of_a_sound_journal_are_the_same_without_texts(
+    flown: Flown, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with opened(flown.journal) as journal:
+        names = field_names_of(journal.meta["setup"])
+        wanted = sensors_of(journal, names, None, is_sound=False)
+        monkeypatch.setattr("analysis.flown.sensor_series.checked", None)  # no text is read
+        found = sensors_of(journal, names, None, is_sound=True)
+    assert found.keys() == wanted.keys()
+    assert found["FlowReport"] is not None
+    for kind, series in wanted.items():
+        own = found[kind]
+        assert (own is None) == (series is None)
+        if own is not None and series is not None:
+            assert own.time_s.tobytes() == series.time_s.tobytes()
+            assert np.array_equal(own.value, series.value, equal_nan=True)
 
 
 def test_a_journal_of_version_1_is_read_from_its_decisions(tmp_path: Path) -> None:
