@@ -71,7 +71,7 @@ COMMANDS = {
         hastes=dict.fromkeys(("list", "show", "pin", "unpin", "prune"), "quick"),
     ),
     "token": Command(
-        target="companion.cli.token:app",
+        target="companion.cli.web_parts:app",
         help="Show the operator's page's links, or make new ones.",
         haste="quick",
     ),

@@ -1,4 +1,4 @@
-"""The operator's page of a run: put together from the configuration, and told what happens."""
+"""The operator's page of a run: from the configuration, told what happens; its token."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from companion.cli.answer import note
-from companion.config import Config
+import typer
+
+from companion.cli.answer import AsJson, Overrides, answer, note
+from companion.config import Config, load
 from companion.config.legal_entries import check
 from companion.config.limits import DROPLETS, OBSERVED_AT, WEATHER, declared_over
 from companion.config.rules import tank_capacity_l
@@ -26,7 +28,7 @@ from companion.link.vehicle_link import VehicleLink
 from companion.ports import Recorder
 from companion.web import Obey, OperatorPage, Order, Outcome, listen, map_object
 from companion.web.frames import number
-from companion.web.guard import Doors, Tokens, is_loopback, kept_tokens
+from companion.web.guard import Doors, Tokens, is_loopback, kept_tokens, new_tokens
 from companion.wording import install_command
 
 TOKENS_NAME = "page-tokens.json"
@@ -322,3 +324,41 @@ def watched(page: OperatorPage, journal: Journal, link: VehicleLink) -> Recorder
 
     page.extras = extras
     return both
+
+
+# ---------------------------------------------------------------------------------- `vrspray token`
+
+app = typer.Typer(
+    add_completion=False,
+    rich_markup_mode=None,
+    help="Links of the operator's page: show, rotate.",
+    epilog="Example: vrspray token show --config /etc/vrspray/config.toml",
+)
+ConfigFile = Annotated[
+    Path, typer.Option("--config", metavar="FILE", help="Configuration, a TOML file.")
+]
+
+
+@app.command(epilog="Example: vrspray token show --config config.toml")
+def show(config_file: ConfigFile, overrides: Overrides = None, as_json: AsJson = False) -> None:
+    """Show the links again, the first as a QR code.
+
+    Whoever has one is let in.
+    """
+    config = load(config_file, overrides=overrides or ())
+    _say(config, kept_tokens(tokens_file(config)), as_json=as_json)
+
+
+@app.command(epilog="Example: vrspray token rotate --config config.toml")
+def rotate(config_file: ConfigFile, overrides: Overrides = None, as_json: AsJson = False) -> None:
+    """Make new tokens instead of all old ones.
+
+    Old links and logins end at the next start of `run`.
+    """
+    config = load(config_file, overrides=overrides or ())
+    _say(config, new_tokens(tokens_file(config)), as_json=as_json)
+
+
+def _say(config: Config, tokens: Tokens, *, as_json: bool) -> None:
+    lines = invitation(config, doors_of(config), tokens)
+    answer({"view": tokens.view, "operate": tokens.operate}, lines, as_json=as_json)
