@@ -34,7 +34,7 @@ from companion.link.vehicle_link import VehicleLink
 from companion.ports import COMMIT_EVERY_S, PlanExecutor, Recorder, Sensor
 
 if TYPE_CHECKING:
-    from companion.cli.notifier import Notifier
+    from companion.cli.systemd import Notifier
     from companion.web import OperatorPage
 
 # By these systemd, or a container, asks to be told of the steps.
@@ -211,7 +211,7 @@ def _notifier() -> Notifier | None:
     """Return what tells systemd, or a container, of each step; None where neither asks."""
     if not _NOTIFY & os.environ.keys():
         return None
-    from companion.cli.notifier import Notifier
+    from companion.cli.systemd import Notifier
 
     return Notifier.from_environment(os.environ, pid=os.getpid())
 

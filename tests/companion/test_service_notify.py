@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from companion.cli.notifier import CLOSING_MAX_S, Notifier
+from companion.cli.systemd import CLOSING_MAX_S, Notifier
 from companion.core.types import Decision, Input, SprayPlan
 from companion.runtime import run
 from tests.builders import setup
