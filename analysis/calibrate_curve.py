@@ -68,7 +68,7 @@ def curve(
 
     Example: vrspray calibrate curve --config config.toml --plot curve.png --write
     """
-    from companion.cli.link_parts import load_with_kept
+    from companion.cli.output_parts import load_with_kept
 
     config, given = load_with_kept(config_file, tuple(overrides or ()))
     sets = weighed_sets(config, config_file)

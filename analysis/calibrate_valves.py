@@ -200,7 +200,7 @@ def valves(
 
     Example: vrspray calibrate valves --config config.toml --plot valves.png --write
     """
-    from companion.cli.link_parts import load_with_kept
+    from companion.cli.output_parts import load_with_kept
 
     config, given = load_with_kept(config_file, tuple(overrides or ()))
     if config.makes_flow:

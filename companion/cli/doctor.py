@@ -17,8 +17,7 @@ from companion.assembly import build_setup, deliverable, flight_map_of
 from companion.cli.answer import AsJson, Overrides, answer
 from companion.cli.doctor_click import guided_click
 from companion.cli.doctor_watchdogs import watchdog_checks
-from companion.cli.link_parts import build_link, load_with_kept
-from companion.cli.output_parts import engine_setup, servo_options
+from companion.cli.output_parts import build_link, engine_setup, load_with_kept, servo_options
 from companion.cli.run import component_options
 from companion.cli.sensor_parts import build_sensors
 from companion.cli.systemd import is_ours, properties, quoted, read_unit, unit_path, watchdog_is_on

@@ -14,7 +14,7 @@ from companion import runtime
 from companion.cli.answer import note
 from companion.cli.ground_doing import INTERRUPTED, Hand, in_words, read_line
 from companion.cli.ground_tasks import ground_setup
-from companion.cli.link_parts import build_link
+from companion.cli.output_parts import build_link
 from companion.cli.run import build_executor, component_options
 from companion.cli.sensor_parts import build_sensors
 from companion.config import Config

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from companion.cli.answer import note
 from companion.cli.ground_doing import in_words, read_line
 from companion.cli.ground_tasks import ground_setup
-from companion.cli.link_parts import build_link
-from companion.cli.output_parts import engine_setup, servo_options
+from companion.cli.output_parts import build_link, engine_setup, servo_options
 from companion.cli.run import component_options
 from companion.cli.systemd import read_unit, systemctl, unit_path
 from companion.config import Config

@@ -38,7 +38,7 @@ from companion.cli.ground_tasks import (
     piece_of,
     plan_line,
 )
-from companion.cli.link_parts import build_link, load_with_kept
+from companion.cli.output_parts import build_link, load_with_kept
 from companion.cli.run import build_executor, component_options, training_mark
 from companion.cli.sensor_parts import build_sensors
 from companion.config import Config

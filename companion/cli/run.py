@@ -18,9 +18,8 @@ from companion import runtime
 from companion.assembly import build_setup, deliverable, flight_map_of, refuse_mismatch
 from companion.cli.answer import AsJson, Overrides, answer, note
 from companion.cli.beside import shown
-from companion.cli.link_parts import build_link, load_with_kept
 from companion.cli.live import Screen, Watcher
-from companion.cli.output_parts import build_outputs, line_warnings
+from companion.cli.output_parts import build_link, build_outputs, line_warnings, load_with_kept
 from companion.cli.record_parts import FREE_MIN_BYTES, follow, made_ready
 from companion.config import Config
 from companion.config.application_table import told

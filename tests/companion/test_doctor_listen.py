@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.cli.link_parts import build_link
-from companion.cli.output_parts import servo_options
+from companion.cli.output_parts import build_link, servo_options
 from companion.cli.run import component_options
 from companion.config import Config, load
 from companion.core.frame import LocalFrame

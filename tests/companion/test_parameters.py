@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.cli.link_parts import build_link, load_with_kept
+from companion.cli.output_parts import build_link, load_with_kept
 from companion.cli.run import component_options
 from companion.core.types import RateOverride
 from companion.errors import ConfigError, LinkError
