@@ -274,7 +274,7 @@ def measuring(
     config: Config, given: tuple[str, ...], told: Sequence[str], *, is_lines: bool
 ) -> Measure:
     """Say what will be done, ask for the word, and return what does each piece."""
-    from companion.cli.ground_doing import (
+    from companion.cli.ground import (
         INTERRUPTED,
         Hand,
         append,
@@ -364,7 +364,7 @@ def done_at_last(measure: Measure, task: GroundTask, what: str) -> Measured:
     Raises:
         ValveCourseError: naming the piece that could not be done.
     """
-    from companion.cli.ground_doing import in_words
+    from companion.cli.ground import in_words
 
     for _ in range(TRIES):
         note(f"{what}: {task.seconds:.0f} s")

@@ -12,7 +12,7 @@ from statistics import fmean
 
 from companion import runtime
 from companion.cli.answer import note
-from companion.cli.ground_doing import INTERRUPTED, Hand, in_words, read_line
+from companion.cli.ground import INTERRUPTED, Hand, in_words, read_line
 from companion.cli.ground_tasks import ground_setup
 from companion.cli.output_parts import build_link
 from companion.cli.run import build_executor, component_options

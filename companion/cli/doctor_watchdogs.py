@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from companion.cli.answer import note
-from companion.cli.ground_doing import in_words, read_line
+from companion.cli.ground import in_words, read_line
 from companion.cli.ground_tasks import ground_setup
 from companion.cli.output_parts import build_link, engine_setup, servo_options
 from companion.cli.run import component_options

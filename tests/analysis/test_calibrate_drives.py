@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from analysis.calibrate_valves import measuring
-from companion.cli import ground_doing
+from companion.cli import ground
 from companion.config.motor_rules import atomisers_of, pump_of
 from companion.ground.shell import GroundOutcome
 from companion.ground.work import GroundKind, GroundTask, Phase
@@ -25,9 +25,9 @@ def test_pump_and_atomisers_run_as_in_flight_while_valves_are_measured(
         done.append(task)
         return GroundOutcome(reasons=frozenset(), open_s=0.0, has_begun=False)
 
-    monkeypatch.setattr(ground_doing, "perform", perform)
-    monkeypatch.setattr(ground_doing, "ask", lambda *_: None)
-    monkeypatch.setattr(ground_doing, "listening", lambda _: 0)
+    monkeypatch.setattr(ground, "perform", perform)
+    monkeypatch.setattr(ground, "ask", lambda *_: None)
+    monkeypatch.setattr(ground, "listening", lambda _: 0)
     count = len(settings.valve)
     phases = (Phase(at_s=0.0, duty=(0.0,) * count), Phase(at_s=1.0, duty=(1.0,) * count))
     piece = GroundTask(kind=GroundKind.VALVES, phases=phases, seconds=2.0)

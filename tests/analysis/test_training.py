@@ -14,7 +14,7 @@ from analysis.flown.read_applied import read_applied
 from analysis.journals.content import read_journal
 from analysis.replay import replay
 from analysis.report import contents
-from companion.cli import ground_doing
+from companion.cli import ground
 from companion.cli.app import execute
 from companion.cli.run import component_options, training_mark
 from companion.cli.sensor_parts import TankSensor
@@ -99,13 +99,13 @@ def test_the_evaluation_carries_the_mark() -> None:
 
 
 def test_ground_work_is_written_a_line_a_piece(tmp_path: Path) -> None:
-    log = ground_doing.ready_log(tmp_path / "flights")
-    assert ground_doing.append(log, {"kind": "prime", "training": "ground"}) is None
-    assert ground_doing.append(log, {"kind": "flush", "training": "ground"}) is None
+    log = ground.ready_log(tmp_path / "flights")
+    assert ground.append(log, {"kind": "prime", "training": "ground"}) is None
+    assert ground.append(log, {"kind": "flush", "training": "ground"}) is None
     kinds = [json.loads(line)["kind"] for line in log.read_text().splitlines()]
     assert kinds == ["prime", "flush"]
-    assert "not written" in (ground_doing.append(tmp_path, {}) or "")
-    assert "not written" in (ground_doing.append(log, {"open_s": float("nan")}) or "")
+    assert "not written" in (ground.append(tmp_path, {}) or "")
+    assert "not written" in (ground.append(log, {"open_s": float("nan")}) or "")
     assert len(log.read_text().splitlines()) == 2
 
 

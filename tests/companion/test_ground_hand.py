@@ -13,7 +13,7 @@ from contextlib import asynccontextmanager, suppress
 
 import pytest
 
-from companion.cli.ground_doing import Hand, read_line
+from companion.cli.ground import Hand, read_line
 
 
 async def until(done: Callable[[], bool]) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.cli.ground_doing import in_words
+from companion.cli.ground import in_words
 from companion.ground.shell import GroundOutcome, perform
 from companion.ground.work import GroundKind, GroundSetup, Hold, clicks, together
 from companion.link.component import ComponentOptions
