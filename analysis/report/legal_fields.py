@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from companion.config.application_table import Profile, is_told
 from companion.config.legal_entries import check, is_number, known
 from companion.config.limits import declared_over
-from companion.config.load import parse_value
+from companion.config.model import parse_value
 from companion.errors import ConfigError
 from companion.journal.writer import DECLARED_META
 from companion.simulated import Simulated

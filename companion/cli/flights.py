@@ -16,7 +16,7 @@ from companion.cli.answer import AsJson, answer, note
 from companion.cli.app import load_command
 from companion.cli.record_parts import rules_of
 from companion.commands import all_registered, command_named, registered
-from companion.config.load import load
+from companion.config.model import load
 from companion.errors import ConfigError
 from companion.journal.folder import Flight, Rules, journals, look_at, prune, set_pinned, space_of
 from companion.journal.geopackage import time_text

@@ -6,7 +6,6 @@ names the file, the key, the value and what to write instead.
 
 from __future__ import annotations
 
-from companion.config.load import load
-from companion.config.model import Config
+from companion.config.model import Config, load
 
 __all__ = ["Config", "load"]

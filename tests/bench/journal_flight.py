@@ -10,7 +10,7 @@ from pathlib import Path
 
 from shapely import box
 
-from companion.config.load import load
+from companion.config.model import load
 from companion.core.controller import Memory, step
 from companion.core.estimator import Track, estimate, observe
 from companion.core.options.coverage import Coverage

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import shapely
 
-from companion.config.load import load
+from companion.config.model import load
 from companion.core.controller import Memory, step
 from companion.core.crossings import Crossing, Route
 from companion.core.options.lines import Lines
