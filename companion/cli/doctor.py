@@ -46,8 +46,16 @@ from companion.doctor.computer import (
     serial_check,
     service_checks,
 )
-from companion.doctor.gpio import engine_checks, gpio_checks, read_chip, read_engine, read_register
-from companion.doctor.sensors import Read, read_sensors, sensor_check
+from companion.doctor.gpio import (
+    Read,
+    engine_checks,
+    gpio_checks,
+    read_chip,
+    read_engine,
+    read_register,
+    read_sensors,
+    sensor_check,
+)
 from companion.doctor.vehicle import Heard, link_checks, listen, no_link, rest_pulses
 from companion.errors import ConfigError, LinkError, MapError
 from companion.flight_map import FlightMap

@@ -8,7 +8,7 @@ import pytest
 
 from companion.core.types import FlowReport, Input, PressureReport, TankReport
 from companion.doctor.check import Status
-from companion.doctor.sensors import Read, read_sensors, sensor_check
+from companion.doctor.gpio import Read, read_sensors, sensor_check
 from companion.errors import SensorError
 
 PRESSURE = PressureReport(received_s=1.0, pressure_kpa=250.0)
