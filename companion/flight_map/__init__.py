@@ -5,8 +5,7 @@ metres of the flight's frame, rates in L/ha, boundary, exclusions and planned li
 it was made with, and what was found on the way.
 """
 
-from companion.flight_map.file import read_flight_map
-from companion.flight_map.model import (
+from companion.flight_map.file import (
     SUFFIX,
     FlightMap,
     SourceFile,
@@ -15,6 +14,7 @@ from companion.flight_map.model import (
     is_flight_map,
     moved,
     named_files,
+    read_flight_map,
 )
 
 __all__ = [

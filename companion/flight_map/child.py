@@ -25,14 +25,15 @@ from companion.commands import is_there
 from companion.config import Config
 from companion.config.tables import PrescriptionTable
 from companion.errors import NOT_ENOUGH_MEMORY, ConfigError, MapError
-from companion.flight_map.file import VERSION, read_flight_map
-from companion.flight_map.model import (
+from companion.flight_map.file import (
     SUFFIX,
+    VERSION,
     FlightMap,
     SourceFile,
     frozen_settings,
     is_flight_map,
     named_files,
+    read_flight_map,
 )
 from companion.wording import show_value
 

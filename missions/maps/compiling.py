@@ -30,8 +30,7 @@ from companion.core.setup import Setup
 from companion.errors import ConfigError, MapError, Problem
 from companion.flight_map import FlightMap, frozen_settings, is_flight_map, read_flight_map
 from companion.flight_map.child import sources_of
-from companion.flight_map.file import SCHEMA, VERSION, content_sha256
-from companion.flight_map.model import named_files
+from companion.flight_map.file import SCHEMA, VERSION, content_sha256, named_files
 from companion.journal.geopackage import (
     LOCAL_ID,
     geometry_blob,

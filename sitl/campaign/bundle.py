@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 from companion.config import load
 from companion.errors import ConfigError, MapError
 from companion.flight_map.child import belonging_files
-from companion.flight_map.model import named_files
+from companion.flight_map.file import named_files
 from sitl.anyang import EXAMPLE
 from sitl.campaign.settings import Value, overrides_of
 from sitl.profile import PROFILES
