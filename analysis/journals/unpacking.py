@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.journal.packing import (
+from companion.journal.rows import (
     ANCHORED,
     BACK,
     BITS,
@@ -56,7 +56,7 @@ class Part:
 def unpack(packed: bytes, dictionary: bytes = b"") -> list[str]:
     """Return the lines that were packed; ValueError for what is no block.
 
-    >>> from companion.journal.packing import pack
+    >>> from companion.journal.rows import pack
     >>> unpack(pack(['{"A":[1.5,2]}', '{"A":[1.75,3]}']))
     ['{"A":[1.5,2]}', '{"A":[1.75,3]}']
     """

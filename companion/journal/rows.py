@@ -1,5 +1,20 @@
 """Rows of the journal: inputs and decisions in packed blocks, and changes of the valves.
 
+What takes the room in a journal are digits: a float of the estimator has seventeen, and none of
+them can be foreseen. So each line is split into its form (the text with a hole for each number)
+and its numbers. Forms repeat, and are kept once a block. A number is kept by what it stands for:
+the place in its object (the third number of a `VehicleState`), whose numbers make one column.
+Of a column is kept only what is new: the same as in the line before costs next to nothing, the
+same as any number of the block (a time that stands in four places) a byte or so. What is new is
+the difference to the one before, as an integer: of decimals where there are few, of the float's
+own bits otherwise; bytes of equal weight lie together, so that deflate finds the zeros.
+
+A packer can have a `follower`, whose lines may refer to the numbers of both: decisions repeat what
+is in the inputs before them, and inputs can be read without the decisions.
+
+A number is taken out only if its text is the one that Python writes for it; so what comes back is
+what went in, whatever it is. Text is ASCII without control characters, as `codec.encode` writes.
+
 A block is a row a commit, with check sums over the text. Inputs (`body`) and decisions lie apart:
 who wants a sensor's values does not unpack decisions, which are ten times as much. Decisions may
 refer to numbers of the inputs before them.
@@ -12,12 +27,254 @@ each valve costs 25 bytes and not a hundred.
 from __future__ import annotations
 
 import math
+import re
 import sqlite3
+import struct
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 from companion.core.types import SprayPlan
-from companion.journal.packing import Packer, deflated
+
+# ------------------------------------------------------------------------------------------ packing
+
+_NUMBER = re.compile(r"(-?\d+(?:\.\d+)?(?:e[+-]\d+)?)")
+FLOAT, INT = "\x01", "\x02"
+HOLE = re.compile(f"([{FLOAT}{INT}])")
+_OBJECT = re.compile(r'\{"(\w+)":|\}')
+_INT_DIGITS_MAX = 15
+# Decimals of a number that is kept as an integer: a monotonic clock has nine.
+_DECIMALS_MAX = 9
+_SCALED_DIGITS_MAX = 18
+# In the place of the count of decimals: kept by the float's bits; by how far they are from those
+# of the first number of the line.
+BITS, ANCHORED = 255, 254
+SAME, NEW, BACK = 0, 1, 2
+_LEVEL = 6
+WORD = struct.Struct("<I")
+
+Key = tuple[str, str, int]
+
+
+def pack(lines: Sequence[str]) -> bytes:
+    """Return the lines in few bytes."""
+    packer = Packer()
+    for line in lines:
+        packer.add(line)
+    return deflated(packer.content(), b"")
+
+
+def deflated(content: bytes, dictionary: bytes) -> bytes:
+    """Return a block's content deflated; a block of before as `dictionary` saves a tenth."""
+    worker = zlib.compressobj(_LEVEL, zdict=dictionary) if dictionary else zlib.compressobj(_LEVEL)
+    return worker.compress(content) + worker.flush()
+
+
+class _Column:
+    """The numbers of one place: a code for each, and those that are new with their anchors."""
+
+    __slots__ = ("anchors", "before", "codes", "fresh", "is_int")
+
+    def __init__(self, *, is_int: bool) -> None:
+        self.is_int = is_int
+        self.before = ""
+        self.codes: list[int] = []
+        self.fresh: list[str] = []
+        self.anchors: list[str] = []
+
+
+class Packer:
+    """Takes lines one by one, so that a commit finds most of the work done."""
+
+    def __init__(self, *, follower: Packer | None = None) -> None:
+        self._follower = follower
+        self._forms: dict[str, tuple[int, list[_Column]]] = {}
+        self._order: list[int] = []
+        self._gaps: list[int] = []
+        self._leads: list[int] = []
+        self._led = 0
+        self._columns: dict[Key, _Column] = {}
+        self._places: dict[str, int] = {}
+        self._seen = 0
+
+    def add(self, line: str, gap: int = 1) -> None:
+        """Take one line; `gap` is how much higher its number is than that of the line before."""
+        form, numbers = _taken_apart(_NUMBER.split(line))
+        known = self._forms.get(form)
+        if known is None:
+            known = self._forms[form] = (len(self._forms), self._columns_of(form))
+        self._order.append(known[0])
+        self._gaps.append(gap)
+        self._leads.append(self._led)
+        self._led = 0
+        if self._follower is not None:
+            self._follower.follow()
+        anchor = ""
+        for column, number in zip(known[1], numbers, strict=True):
+            if column.is_int:
+                column.fresh.append(number)
+                continue
+            if number == column.before:
+                column.codes.append(SAME)
+            else:
+                self._take(column, number, anchor)
+            anchor = anchor or number
+
+    def _columns_of(self, form: str) -> list[_Column]:
+        columns = self._columns
+        return [columns.setdefault(key, _Column(is_int=key[0] == INT)) for key in keys_of(form)]
+
+    def _take(self, column: _Column, number: str, anchor: str) -> None:
+        column.before = number
+        place = self._places.get(number)
+        if place is None:
+            self.see(number)
+            if self._follower is not None:
+                self._follower.see(number)
+            column.codes.append(NEW)
+            column.fresh.append(number)
+            column.anchors.append(anchor)
+        else:
+            column.codes.append(BACK + self._seen - 1 - place)
+
+    def follow(self) -> None:
+        """Note that the leader has taken a line."""
+        self._led += 1
+
+    def see(self, number: str) -> None:
+        """Note a new number, of this packer's or of its leader's lines."""
+        self._places[number] = self._seen
+        self._seen += 1
+
+    def content(self) -> bytes:
+        """Return all of it, still to be deflated."""
+        forms = "\n".join(self._forms).encode("ascii")
+        out = bytearray(WORD.pack(len(self._order)) + WORD.pack(len(forms)) + forms)
+        put_all(out, [_unsigned(gap) for gap in self._gaps])
+        put_all(out, self._leads)
+        put_all(out, self._order)
+        for column in self._columns.values():
+            if column.is_int:
+                put_all(out, differences([int(number) for number in column.fresh]))
+            else:
+                put_all(out, column.codes)
+        for column in self._columns.values():
+            if not column.is_int and column.fresh:
+                _put_floats(out, column)
+        return bytes(out)
+
+
+def _taken_apart(parts: list[str]) -> tuple[str, list[str]]:
+    """Return the form and the numbers of a line that was split at what may be numbers."""
+    numbers = []
+    for place in range(1, len(parts), 2):
+        text = parts[place]
+        if "." in text or "e" in text:
+            if repr(float(text)) != text:
+                continue
+            parts[place] = FLOAT
+        elif len(text) <= _INT_DIGITS_MAX and str(int(text)) == text:
+            parts[place] = INT
+        else:
+            continue
+        numbers.append(text)
+    return "".join(parts), numbers
+
+
+@lru_cache(maxsize=4096)
+def keys_of(form: str) -> tuple[Key, ...]:
+    """Return for each hole of a form what its number is: kind, object, how manieth in it."""
+    keys = []
+    inside: list[list[object]] = [["", 0]]
+    for part in HOLE.split(form):
+        if part in (FLOAT, INT):
+            name, count = inside[-1]
+            keys.append((part, str(name), int(str(count))))
+            inside[-1][1] = int(str(count)) + 1
+            continue
+        for found in _OBJECT.finditer(part):
+            if found[1] is not None:
+                inside.append([found[1], 0])
+            elif len(inside) > 1:
+                inside.pop()
+    return tuple(keys)
+
+
+def differences(values: Sequence[int]) -> list[int]:
+    """Return each value's difference to the one before, the sign in the lowest bit."""
+    found, before = [], 0
+    for value in values:
+        found.append(_unsigned(value - before))
+        before = value
+    return found
+
+
+def _unsigned(value: int) -> int:
+    return value << 1 if value >= 0 else (-value << 1) - 1
+
+
+def put_all(out: bytearray, values: Sequence[int]) -> None:
+    """Write integers from 0 on, seven bits a byte."""
+    if max(values, default=0) <= 0x7F:
+        out += bytes(values)
+        return
+    for value in values:
+        while value > 0x7F:
+            out.append(value & 0x7F | 0x80)
+            value >>= 7
+        out.append(value)
+
+
+def _put_floats(out: bytearray, column: _Column) -> None:
+    """Write new floats: how, then the bytes of their differences, those of least weight first."""
+    texts = column.fresh
+    how = _decimals_of(texts)
+    if how == BITS:
+        values = bits_of(texts)
+        words = differences(values)
+        # What follows from the first number of its line (the end of a lease) differs from it
+        # always by nearly the same.
+        if all(column.anchors):
+            anchored = [a - b for a, b in zip(values, bits_of(column.anchors), strict=True)]
+            other = differences(anchored)
+            if sum(map(int.bit_length, other)) < sum(map(int.bit_length, words)):
+                how, words = ANCHORED, other
+    else:
+        words = differences([_scaled(text, how) for text in texts])
+    width = (max(words).bit_length() + 7) // 8
+    out += bytes((how, width))
+    raw = b"".join([word.to_bytes(width, "little") for word in words])
+    for plane in range(width):
+        out += raw[plane::width]
+
+
+def _decimals_of(texts: Sequence[str]) -> int:
+    most = 0
+    for text in texts:
+        decimals = len(text) - text.find(".") - 1
+        if decimals > _DECIMALS_MAX or "e" in text or text == "-0.0":
+            return BITS
+        most = max(most, decimals)
+    long = any(text.find(".") + most > _SCALED_DIGITS_MAX for text in texts)
+    return BITS if long else most
+
+
+def _scaled(text: str, decimals: int) -> int:
+    whole, _, part = text.partition(".")
+    return int(whole + part.ljust(decimals, "0"))
+
+
+def bits_of(texts: Sequence[str]) -> list[int]:
+    """Return the floats' bits, as integers in the order of the numbers."""
+    packed = struct.pack(f"<{len(texts)}d", *map(float, texts))
+    return [
+        word if word >= 0 else -(word & 0x7FFF_FFFF_FFFF_FFFF) - 1
+        for word in struct.unpack(f"<{len(texts)}q", packed)
+    ]
+
+
+# --------------------------------------------------------------------------------------------- rows
 
 # A second of a flight has a hundred rows; a simulation has thousands, which are several blocks.
 ROWS_MAX = 1000

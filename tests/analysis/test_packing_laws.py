@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from analysis.flown.sensor_series import Wanted, numbers_of, quick_numbers
 from analysis.journals.unpacking import part_of, unpack
-from companion.journal.packing import Packer, pack
+from companion.journal.rows import Packer, pack
 
 NUMBERS = st.one_of(
     st.floats(),

@@ -27,7 +27,7 @@ TABLES: dict[str, str] = {
     "link_stats": "how the link did, once a second",
     "coverage_tiles": "treated ground, in tiles of 64 x 64 cells of 0.2 m",
     "events": "what else happened",
-    "blocks": "a second of inputs and decisions in each row: lines of JSON, packed (`companion/journal/packing.py`, "
+    "blocks": "a second of inputs and decisions in each row: lines of JSON, packed (`companion/journal/rows.py`, "
     "`analysis/journals/unpacking.py`)",
     "block_dictionaries": "preset dictionaries for unpacking the blocks",
     "meta": "facts about the flight, each with a key",
