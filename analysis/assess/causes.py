@@ -491,7 +491,7 @@ def marks_of(strip: Strip, setup: Setup) -> Marks:
 
 # What the operator wished of the rates in flight: another percentage than all of them.
 
-# As `companion/link/commands.py` writes the event.
+# As `companion/link/service.py` writes the event.
 _EVENT = re.compile(r"rate override (\d+(?:\.\d+)?(?:e[+-]?\d+)?) %")
 
 

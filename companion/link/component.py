@@ -36,7 +36,6 @@ from companion.core.types import (
 )
 from companion.link.announcer import Announcer
 from companion.link.codec import Codec
-from companion.link.commands import REQUEST_MESSAGE, SET_MESSAGE_INTERVAL, Answer, Desk
 from companion.link.encode import Encoder
 from companion.link.messages import (
     AckReceived,
@@ -54,7 +53,14 @@ from companion.link.messages import (
 )
 from companion.link.outputs import ORDERS, Outputs
 from companion.link.parameters import Parameters
-from companion.link.service import OnEvent, Service
+from companion.link.service import (
+    REQUEST_MESSAGE,
+    SET_MESSAGE_INTERVAL,
+    Answer,
+    Desk,
+    OnEvent,
+    Service,
+)
 from companion.link.simulation import SimulationWatch
 from companion.link.streams import Meter, Stream, StreamRequest, StreamSupervisor, wanted_streams
 from companion.simulated import SIMULATED

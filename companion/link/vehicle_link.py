@@ -17,11 +17,10 @@ from companion.core.types import (
     RateOverride,
 )
 from companion.link.census import Census, Vehicle, autopilot_name
-from companion.link.commands import Answer
 from companion.link.component import Component, ComponentOptions
 from companion.link.outputs import OutputListener
 from companion.link.parameters import Parameters
-from companion.link.service import OnEvent
+from companion.link.service import Answer, OnEvent
 from companion.link.streams import LinkStatistics
 from companion.link.transport import (
     LinkUrl,

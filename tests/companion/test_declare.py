@@ -24,7 +24,7 @@ from companion.core.safety import Limits, inhibits
 from companion.core.types import Inhibit
 from companion.journal.journal import Journal
 from companion.journal.reader import opened
-from companion.link.commands import Answer
+from companion.link.service import Answer
 from companion.web import Order, Outcome
 from companion.web.page import parse_order
 from tests.builders import SPRAYING, position, setup

@@ -29,7 +29,7 @@ from typer.testing import CliRunner
 
 from companion.cli.app import app
 from companion.config.model import Config
-from companion.link.commands import DO_SPRAYER, USER_ESTOP
+from companion.link.service import DO_SPRAYER, USER_ESTOP
 from tests.compiling_here import compiled_here
 from tests.reference.words import words_in
 

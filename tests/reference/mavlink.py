@@ -9,7 +9,7 @@ import re
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.link import announcer, codec, encode
-from companion.link import commands as link_commands
+from companion.link import service as link_commands
 from companion.link.parameters import SETTINGS, known_parameters
 
 INTRODUCTION = """# MAVLink
