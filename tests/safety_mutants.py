@@ -23,7 +23,7 @@ SOURCES = (
     "companion/core/safety.py",
     "companion/output/engine/engine.py",
     "companion/output/engine/engine.py",
-    "companion/output/pulse_train.py",
+    "companion/output/pwm.py",
     "companion/output/pwm.py",
     "companion/output/return_valve.py",
     "companion/output/timed.py",

@@ -21,7 +21,7 @@ from functools import cache
 import numpy as np
 
 from companion.ground.clicks import ClickFlow, ClickJudgement, ClickLaw, judge_clicks
-from companion.output.pulse_train import Edge
+from companion.output.pwm import Edge
 from sitl.plant import PulsedPlant
 from sitl.profile import ML_S_PER_L_MIN, PlantProfile, load_profile
 

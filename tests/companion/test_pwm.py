@@ -7,8 +7,14 @@ import numpy as np
 import pytest
 
 from companion.core.types import PwmLimits, SprayPlan, TimedChange
-from companion.output.pulse_train import STRETCH_MAX, carried_debt
-from companion.output.pwm import Edge, PulseEngine, needs_restart, stagger
+from companion.output.pwm import (
+    STRETCH_MAX,
+    Edge,
+    PulseEngine,
+    carried_debt,
+    needs_restart,
+    stagger,
+)
 
 PWM = PwmLimits(frequency_hz=11.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)
 T = PWM.period_s

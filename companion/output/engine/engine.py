@@ -25,8 +25,7 @@ from companion.output.engine.wire import (
     pack_status,
     plan_from,
 )
-from companion.output.pulse_train import Edge
-from companion.output.pwm import PulseEngine
+from companion.output.pwm import Edge, PulseEngine
 
 # Between two signs of life; the ALIVE line changes as often, four times in a monostable's 0.2 s.
 BEAT_S = 0.05
