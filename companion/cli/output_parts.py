@@ -29,7 +29,7 @@ from companion.ports import PlanExecutor
 
 if TYPE_CHECKING:
     from companion.output.autopilot_options import DriveOutput, ServoOptions
-    from companion.output.engine.setup import EngineSetup
+    from companion.output.engine.wire import EngineSetup
     from companion.output.gpio import GpioExecutor
     from companion.output.hardware_pwm import PwmDrive
     from companion.output.servo import ServoExecutor
@@ -141,7 +141,7 @@ def parts_of(executor: PlanExecutor) -> tuple[PlanExecutor, ...]:
 
 def engine_setup(config: Config) -> EngineSetup:
     """Return the wiring and limits of a configuration with `output.kind = "gpio"`."""
-    from companion.output.engine.setup import EngineSetup, Wiring
+    from companion.output.engine.wire import EngineSetup, Wiring
 
     output, gpio = config.output, config.gpio
     wiring = Wiring(

@@ -25,7 +25,7 @@ from companion.doctor.check import Check, fail, not_applicable, ok, split_advice
 from companion.errors import ActuatorError, SensorError
 from companion.output.engine.lines import CONSUMER, find_chip, keeps_levels, load_gpiod
 from companion.output.engine.selftest import SelfTest
-from companion.output.engine.setup import WAKE_LATE_MAX_S, EngineSetup, Wiring, hazards
+from companion.output.engine.wire import WAKE_LATE_MAX_S, EngineSetup, Wiring, hazards
 from companion.output.gpio import GpioExecutor
 from companion.ports import Sensor
 from companion.wording import install_command

@@ -24,9 +24,9 @@ from companion.core.types import SprayPlan
 from companion.errors import ActuatorError
 from companion.output.engine.lines import Lines, open_lines
 from companion.output.engine.selftest import SelfTest
-from companion.output.engine.setup import EngineSetup
 from companion.output.engine.wire import (
     PACKET_MAX,
+    EngineSetup,
     Issued,
     Kind,
     RefusedError,

@@ -24,8 +24,15 @@ from companion.core.types import PwmLimits, SprayPlan, TimedChange
 from companion.output.engine.engine import Engine
 from companion.output.engine.lines import MemoryLines
 from companion.output.engine.process import boot_s
-from companion.output.engine.setup import EngineSetup, Wiring
-from companion.output.engine.wire import Issued, Kind, edges_from, pack_plan, unpack
+from companion.output.engine.wire import (
+    EngineSetup,
+    Issued,
+    Kind,
+    Wiring,
+    edges_from,
+    pack_plan,
+    unpack,
+)
 from companion.output.gpio import GpioExecutor
 from companion.runtime import precise_event_loop
 from tests.bench.figures import Figure

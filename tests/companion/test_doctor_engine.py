@@ -10,7 +10,7 @@ from companion.doctor.check import Status
 from companion.doctor.gpio import engine_checks, read_engine
 from companion.errors import ActuatorError
 from companion.output.engine.selftest import SelfTest
-from companion.output.engine.setup import EngineSetup, Wiring
+from companion.output.engine.wire import EngineSetup, Wiring
 
 PWM = PwmLimits(frequency_hz=11.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)
 FOUND = SelfTest(

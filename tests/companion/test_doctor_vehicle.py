@@ -18,7 +18,7 @@ from companion.doctor.computer import Device, read_device, serial_check
 from companion.doctor.gpio import Chip, Line, gpio_checks, read_chip, read_register
 from companion.doctor.vehicle import Heard, Position, Rate, link_checks, no_link
 from companion.output.autopilot_options import DriveOutput, ServoOptions
-from companion.output.engine.setup import Wiring
+from companion.output.engine.wire import Wiring
 from missions.maps.compiling import compiled_setup
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "anyang"

@@ -27,7 +27,7 @@ from companion.doctor.check import Check, Status, is_ready
 from companion.doctor.gpio import EngineTrial, try_engine
 from companion.ground.work import GroundSetup
 from companion.output.autopilot_options import ServoOptions
-from companion.output.engine.setup import EngineSetup, Wiring
+from companion.output.engine.wire import EngineSetup, Wiring
 from companion.output.gpio import GpioExecutor
 
 PWM = PwmLimits(frequency_hz=11.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)

@@ -13,11 +13,12 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from companion.core.types import PwmLimits, SprayPlan, TimedChange
 from companion.output.engine.engine import GAP_S, Engine
 from companion.output.engine.lines import MemoryLines
-from companion.output.engine.setup import EngineSetup, Wiring
 from companion.output.engine.wire import (
+    EngineSetup,
     Issued,
     Kind,
     RefusedError,
+    Wiring,
     edges_from,
     pack_plan,
     plan_from,

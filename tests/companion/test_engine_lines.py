@@ -20,7 +20,7 @@ from companion.output.engine.lines import (
     load_gpiod,
     open_lines,
 )
-from companion.output.engine.setup import EngineSetup, Wiring
+from companion.output.engine.wire import EngineSetup, Wiring
 from tests.fake_gpiod import FakeChip, FakeGpiod
 
 PWM = PwmLimits(frequency_hz=11.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)

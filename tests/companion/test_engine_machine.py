@@ -18,8 +18,15 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from companion.core.types import PwmLimits, SprayPlan, TimedChange
 from companion.output.engine.engine import GAP_S, KEPT, Engine
 from companion.output.engine.lines import MemoryLines
-from companion.output.engine.setup import EngineSetup, Wiring
-from companion.output.engine.wire import CHANGES_MAX, Kind, edges_from, pack_plan, unpack
+from companion.output.engine.wire import (
+    CHANGES_MAX,
+    EngineSetup,
+    Kind,
+    Wiring,
+    edges_from,
+    pack_plan,
+    unpack,
+)
 
 WIRING = Wiring(valves=(1, 2, 3), return_line=4, alive_line=5)
 COUNT = len(WIRING.valves)

@@ -19,8 +19,7 @@ from companion.core.types import PwmLimits, SprayPlan, TimedChange
 from companion.errors import ActuatorError
 from companion.output.engine import process
 from companion.output.engine.selftest import WAKES, SelfTest
-from companion.output.engine.setup import EngineSetup, Wiring
-from companion.output.engine.wire import CHANGES_MAX, Kind, pack
+from companion.output.engine.wire import CHANGES_MAX, EngineSetup, Kind, Wiring, pack
 from companion.output.gpio import LATE_MAX_S, GpioExecutor
 
 PWM = PwmLimits(frequency_hz=11.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)

@@ -10,7 +10,7 @@ import pytest
 from companion.core.types import PwmLimits
 from companion.output.engine.lines import MemoryLines
 from companion.output.engine.selftest import ROUNDS, WAKE_S, WAKES, SelfTest, self_test
-from companion.output.engine.setup import WAKE_LATE_MAX_S, EngineSetup, Wiring
+from companion.output.engine.wire import WAKE_LATE_MAX_S, EngineSetup, Wiring
 
 WIRING = Wiring(valves=(17, 18), return_line=22, alive_line=4, normally_open=True)
 ALIVE = 0b1000

@@ -11,8 +11,16 @@ import pytest
 from companion.core.types import PwmLimits, SprayPlan, TimedChange
 from companion.output.engine.engine import BEAT_S, GAP_S, Engine
 from companion.output.engine.lines import MemoryLines
-from companion.output.engine.setup import EngineSetup, Wiring
-from companion.output.engine.wire import Issued, Kind, edges_from, pack, pack_plan, unpack
+from companion.output.engine.wire import (
+    EngineSetup,
+    Issued,
+    Kind,
+    Wiring,
+    edges_from,
+    pack,
+    pack_plan,
+    unpack,
+)
 
 PWM = PwmLimits(frequency_hz=10.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)
 WIRING = Wiring(valves=(17, 18), return_line=22, alive_line=4)

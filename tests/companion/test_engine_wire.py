@@ -7,15 +7,17 @@ from typing import Any
 import pytest
 
 from companion.core.types import PwmLimits, SprayPlan, TimedChange
-from companion.output.engine.setup import EngineSetup, Wiring, hazards
 from companion.output.engine.wire import (
     CHANGES_MAX,
     PACKET_MAX,
+    EngineSetup,
     Issued,
     Kind,
     RefusedError,
     Status,
+    Wiring,
     edges_from,
+    hazards,
     pack_edges,
     pack_plan,
     pack_status,

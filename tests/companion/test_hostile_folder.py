@@ -17,8 +17,7 @@ from analysis.fleet.adding import ALONE, _no_module_of_this_folder, add
 from analysis.fleet.store import Store
 from companion.cli.folders_own import _in_root
 from companion.core.types import PwmLimits
-from companion.output.engine.setup import EngineSetup, Wiring
-from companion.output.engine.wire import PACKET_MAX, Kind, pack, unpack
+from companion.output.engine.wire import PACKET_MAX, EngineSetup, Kind, Wiring, pack, unpack
 from companion.output.gpio import COMMAND, EngineChild
 from sitl.workers import do_all
 from tests.companion.test_service_unit import UNIT

@@ -12,7 +12,7 @@ from companion.config import Config, load
 from companion.core.types import SprayPlan, TimedChange
 from companion.errors import ConfigError
 from companion.output.engine.closer import closer_arguments
-from companion.output.engine.setup import hazards
+from companion.output.engine.wire import hazards
 from companion.output.pwm import PulseEngine
 from missions.maps.compiling import compiled_setup
 

@@ -8,7 +8,7 @@ from companion.cli.sensor_parts import GpiodEdges
 from companion.doctor.check import Check
 from companion.doctor.gpio import gpio_checks, read_chip
 from companion.output.engine.lines import GpiodLines, load_gpiod
-from companion.output.engine.setup import Wiring
+from companion.output.engine.wire import Wiring
 from tests.gpio.sim import SimChip
 
 pytestmark = pytest.mark.needs_gpiosim

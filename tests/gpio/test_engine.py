@@ -19,8 +19,7 @@ import pytest
 
 from companion.core.types import PwmLimits, SprayPlan, TimedChange
 from companion.output.engine.lines import GpiodLines, load_gpiod
-from companion.output.engine.setup import EngineSetup, Wiring
-from companion.output.engine.wire import PACKET_MAX, Kind, pack, unpack
+from companion.output.engine.wire import PACKET_MAX, EngineSetup, Kind, Wiring, pack, unpack
 from companion.output.gpio import COMMAND, EngineChild, GpioExecutor
 from tests.gpio.sim import SimChip
 

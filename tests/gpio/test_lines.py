@@ -11,7 +11,7 @@ from companion.core.types import PwmLimits
 from companion.errors import ActuatorError
 from companion.output.engine import closer
 from companion.output.engine.lines import GpiodLines, Lines, find_chip, load_gpiod, open_lines
-from companion.output.engine.setup import EngineSetup, Wiring
+from companion.output.engine.wire import EngineSetup, Wiring
 from tests.gpio.sim import SimChip
 
 pytestmark = pytest.mark.needs_gpiosim

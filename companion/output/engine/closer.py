@@ -18,7 +18,7 @@ from typing import TypeVar
 
 from companion.errors import ActuatorError
 from companion.output.engine.lines import GpiodLines, Lines, SpiRegister, load_gpiod, open_port
-from companion.output.engine.setup import EngineSetup
+from companion.output.engine.wire import EngineSetup
 
 # An engine that is just dying still holds its lines.
 PATIENCE_S = 2.0
@@ -30,7 +30,7 @@ def closer_arguments(setup: EngineSetup) -> list[str]:
     """Return the arguments with which the closer makes these outputs safe.
 
     >>> from companion.core.types import PwmLimits
-    >>> from companion.output.engine.setup import Wiring
+    >>> from companion.output.engine.wire import Wiring
     >>> pwm = PwmLimits(frequency_hz=11, duty_min=0.2, duty_max=0.9, min_on_s=0, min_off_s=0)
     >>> wiring = Wiring(valves=(17, 18), return_line=22, return_normally_open=False)
     >>> closer_arguments(EngineSetup(wiring=wiring, pwm=pwm))

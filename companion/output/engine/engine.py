@@ -14,9 +14,9 @@ from itertools import islice
 from companion.core.types import SprayPlan
 from companion.output.engine.lines import Lines
 from companion.output.engine.selftest import wrong_lines
-from companion.output.engine.setup import EngineSetup
 from companion.output.engine.wire import (
     EDGES_MAX,
+    EngineSetup,
     Kind,
     RefusedError,
     Status,

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from companion.errors import ActuatorError, VrsprayError
-from companion.output.engine.setup import EngineSetup
+from companion.output.engine.wire import EngineSetup
 from companion.wording import install_command
 
 

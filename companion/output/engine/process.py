@@ -21,8 +21,15 @@ from companion.errors import ActuatorError
 from companion.output.engine.engine import Engine
 from companion.output.engine.lines import keeps_levels, open_lines
 from companion.output.engine.selftest import self_test
-from companion.output.engine.setup import EngineSetup, hazards
-from companion.output.engine.wire import PACKET_MAX, Kind, RefusedError, pack, unpack
+from companion.output.engine.wire import (
+    PACKET_MAX,
+    EngineSetup,
+    Kind,
+    RefusedError,
+    hazards,
+    pack,
+    unpack,
+)
 
 # What the socket holds is read in this many packets at most before edges are looked at again.
 _PACKETS_AT_ONCE = 2

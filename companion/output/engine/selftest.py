@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from companion.output.engine.lines import Lines
-from companion.output.engine.setup import Wiring
+from companion.output.engine.wire import Wiring
 
 # The second worst of so many is the 99th percentile.
 WAKES = 100

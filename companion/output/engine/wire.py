@@ -1,4 +1,4 @@
-"""What passes between companion and engine: one packet a message, checked as a whole.
+"""What passes between companion and engine: its set-up first, then one packet a message.
 
 A packet is a head (magic, version, kind, length and checksum of the body) and a body. The socket
 keeps packets apart; the length tells one that was cut. What does not decode is refused whole.
@@ -6,14 +6,178 @@ keeps packets apart; the length tells one that was cut. What does not decode is 
 
 from __future__ import annotations
 
+import json
 import math
 import struct
 import zlib
 from collections.abc import Iterable
+from dataclasses import asdict, dataclass
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
-from companion.core.types import SprayPlan, TimedChange
+from companion.core.types import PwmLimits, SprayPlan, TimedChange
+
+# --------------------------------------------------------------------------------------- the set-up
+
+# What hangs on the lines: which level opens, which one is safe, what remains without a program.
+#
+# Outputs are numbered: the valves from the left, the return valve behind them if there is one, the
+# ALIVE line last if there is one. Their levels travel as the bits of one integer.
+
+# Lines that one request of the kernel's GPIO interface can hold, and outputs of 8 registers.
+OUTPUTS_MAX = 64
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wiring:
+    """Lines (or register outputs), kinds of valve, and the drivers' polarity.
+
+    A coil that draws current opens a normally closed valve and shuts a normally open one. With
+    `active_low` a driver sends current while its line is low.
+    """
+
+    valves: tuple[int, ...]
+    return_line: int | None = None
+    alive_line: int | None = None
+    normally_open: bool = False
+    return_normally_open: bool = True
+    active_low: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.valves or len(set(self.lines)) != len(self.lines):
+            raise ValueError(f"each output needs a line of its own, got {self.lines}")
+        if not len(self.lines) <= OUTPUTS_MAX:
+            raise ValueError(f"at most {OUTPUTS_MAX} outputs, got {len(self.lines)}")
+        if not all(0 <= line <= 1023 for line in self.lines):
+            raise ValueError(f"lines are 0 to 1023, got {self.lines}")
+
+    @property
+    def lines(self) -> tuple[int, ...]:
+        """Return the line of each output, by its number."""
+        more = (self.return_line, self.alive_line)
+        return self.valves + tuple(line for line in more if line is not None)
+
+    @property
+    def has_return(self) -> bool:
+        """Return whether there is a return valve."""
+        return self.return_line is not None
+
+    @property
+    def alive(self) -> int | None:
+        """Return the number of the ALIVE output."""
+        return None if self.alive_line is None else len(self.lines) - 1
+
+    def level(self, output: int, *, is_open: bool) -> bool:
+        """Return the level that opens or shuts the valve at an output.
+
+        >>> Wiring(valves=(17,)).level(0, is_open=True)
+        True
+        >>> Wiring(valves=(17,), normally_open=True).level(0, is_open=True)
+        False
+        """
+        opens_idle = self.normally_open if output < len(self.valves) else self.return_normally_open
+        has_current = is_open != opens_idle
+        return has_current != self.active_low
+
+    @property
+    def safe_levels(self) -> int:
+        """Return the levels of the safe state: valves shut, return open, ALIVE low.
+
+        >>> bin(Wiring(valves=(17, 18), normally_open=True).safe_levels)
+        '0b11'
+        """
+        levels = 0
+        for output in range(len(self.valves) + self.has_return):
+            levels |= self.level(output, is_open=output >= len(self.valves)) << output
+        return levels
+
+
+def hazards(wiring: Wiring, *, keeps_levels: bool | None) -> list[str]:
+    """Return what happens to these valves when the program dies or the power fails.
+
+    `keeps_levels` is whether this kernel leaves a released line at its last level (Raspberry Pi's
+    without `strict_gpiod`); None where the driver does not say.
+    """
+    found = []
+    if wiring.normally_open:
+        found.append(
+            "normally open valves spray when their power fails: only the pump's cut-off stops them"
+        )
+        if keeps_levels is False:
+            found.append(
+                "lines become inputs when the engine ends, so normally open valves open: remove "
+                "strict_gpiod from config.txt"
+            )
+    elif keeps_levels:
+        found.append(
+            "a killed engine leaves its valves as they were: add dtparam=strict_gpiod to config.txt"
+        )
+    if wiring.alive_line is None:
+        found.append("no ALIVE line: a stopped computer leaves its valves as they were")
+    return found
+
+
+Backend = Literal["gpiod", "spi595", "memory", "file"]
+
+# A lease that reaches farther is a mistake of clocks: the configuration allows 2 s.
+LEASE_MAX_S = 2.5
+# Wake-ups later than this at the 99th percentile: 30 mm at 6 m/s.
+WAKE_LATE_MAX_S = 0.005
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EngineSetup:
+    """Wiring, limits of the valves, the device, and what of the system to ask for.
+
+    `device` is a chip's name, path or label, the file of an SPI device, or a file of levels.
+    `overrun_s` is how much longer a valve delivers than its pulse lasts, where it is known.
+    `wake_late_max_s` is what the self-test allows; None is `WAKE_LATE_MAX_S` for real outputs, and
+    no limit for those in memory or a file, which move nothing.
+    """
+
+    wiring: Wiring
+    pwm: PwmLimits
+    backend: Backend = "gpiod"
+    device: str = "gpiochip0"
+    overrun_s: float = 0.0
+    lease_max_s: float = LEASE_MAX_S
+    realtime: bool = True
+    spi_hz: int = 1_000_000
+    wake_late_max_s: float | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.overrun_s <= self.pwm.min_off_s:
+            raise ValueError(f"overrun_s must lie in [0, min_off_s], got {self.overrun_s}")
+        if not 0.0 < self.lease_max_s <= 10.0:
+            raise ValueError(f"lease_max_s must lie in (0, 10], got {self.lease_max_s}")
+        if not 10_000 <= self.spi_hz <= 20_000_000:
+            raise ValueError(f"spi_hz must lie in [10000, 20000000], got {self.spi_hz}")
+        if self.wake_late_max_s is not None and not self.wake_late_max_s >= 0.0:
+            raise ValueError(f"wake_late_max_s must be at least 0, got {self.wake_late_max_s}")
+        if self.backend not in get_args(Backend):
+            raise ValueError(f"no such lines: {self.backend}")
+
+    @property
+    def late_max_s(self) -> float:
+        """Return how late wake-ups may be, at the 99th percentile, for the self-test to pass."""
+        if self.wake_late_max_s is not None:
+            return self.wake_late_max_s
+        return WAKE_LATE_MAX_S if self.backend in ("gpiod", "spi595") else math.inf
+
+    def as_bytes(self) -> bytes:
+        """Return the set-up as text of JSON."""
+        return json.dumps(asdict(self)).encode()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> EngineSetup:
+        """Return the set-up of `as_bytes`; ValueError or TypeError for anything else."""
+        found: dict[str, Any] = json.loads(data)
+        wiring, pwm = dict(found.pop("wiring")), found.pop("pwm")
+        wiring["valves"] = tuple(wiring["valves"])
+        return cls(wiring=Wiring(**wiring), pwm=PwmLimits(**pwm), **found)
+
+
+# ------------------------------------------------------------------------------------------ packets
 
 MAGIC, VERSION = 0x5652, 1
 _HEAD = struct.Struct("<HBBII")

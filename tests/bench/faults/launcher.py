@@ -13,7 +13,7 @@ from pathlib import Path
 from companion.errors import ActuatorError
 from companion.output.engine import lines
 from companion.output.engine.lines import Lines
-from companion.output.engine.setup import EngineSetup
+from companion.output.engine.wire import EngineSetup
 from tests.bench.faults.chip import Chip, ChipLines
 
 _MODULE = "tests.bench.faults.launcher"

@@ -12,7 +12,7 @@ import pytest
 from companion.core.types import PwmLimits, TimedChange
 from companion.output.autopilot_options import DriveOutput
 from companion.output.composite import CompositeExecutor, Part
-from companion.output.engine.setup import EngineSetup, Wiring
+from companion.output.engine.wire import EngineSetup, Wiring
 from companion.output.gpio import GpioExecutor
 from companion.output.servo import ServoExecutor, ServoOptions
 from companion.output.timed import DryRunExecutor

@@ -16,8 +16,7 @@ from companion.ground.shell import GroundOutcome, perform
 from companion.ground.work import GroundKind, GroundSetup, Hold, clicks, together
 from companion.link.component import ComponentOptions
 from companion.link.vehicle_link import VehicleLink
-from companion.output.engine.setup import EngineSetup, Wiring
-from companion.output.engine.wire import Issued
+from companion.output.engine.wire import EngineSetup, Issued, Wiring
 from companion.output.gpio import GpioExecutor
 from companion.output.servo import ServoExecutor, ServoOptions
 from tests import builders

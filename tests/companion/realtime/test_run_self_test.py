@@ -9,7 +9,7 @@ import pytest
 
 from companion.link.component import ComponentOptions
 from companion.link.vehicle_link import VehicleLink
-from companion.output.engine.setup import EngineSetup, Wiring
+from companion.output.engine.wire import EngineSetup, Wiring
 from companion.output.gpio import GpioExecutor
 from companion.runtime import NoRecorder, run
 from tests import builders
