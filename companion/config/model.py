@@ -1,4 +1,4 @@
-"""The configuration as a whole: read from its file, one line on what is wrong, in types of the core."""
+"""The configuration as a whole: read from its file, or one line why not; in the core's types."""
 
 from __future__ import annotations
 

@@ -154,9 +154,9 @@ def test_run_loads_what_every_flight_needs_and_no_more() -> None:
     # Each of these is loaded by the configuration that switches it on.
     optional = {
         "companion/config": {"legal_entries", "limits", "motor_rules", "wiring_rules", "wording"},
-        "companion/cli": {"drawing", "folders_own", "notifier", "sensor_parts", "web_parts"},
+        "companion/cli": {"drawing", "folders_own", "sensor_parts", "systemd", "web_parts"},
         "companion/link": {"mission_reader", "serial_port", "signing"},
-        "companion/output": {"composite", "gpio", "hardware_pwm", "pulse_train", "pwm", "servo"},
+        "companion/output": {"composite", "gpio", "hardware_pwm", "pwm", "servo"},
     }
     of_options = {f"{folder}/{name}.py" for folder, names in optional.items() for name in names}
     assert all((ROOT / name).is_file() for name in of_options)
