@@ -16,7 +16,7 @@ from companion.cli.ground import INTERRUPTED, Hand, in_words, read_line
 from companion.cli.ground_tasks import ground_setup
 from companion.cli.output_parts import build_link
 from companion.cli.run import build_executor, component_options
-from companion.cli.sensor_parts import build_sensors
+from companion.cli.sensor_parts import EstopSwitch, build_sensors
 from companion.config import Config
 from companion.core.inputs import AutopilotLiquid
 from companion.core.types import BatteryReport, Decision, FaultKind, FlowReport, Input
@@ -36,7 +36,6 @@ from companion.ground.work import (
     flow_of,
 )
 from companion.ports import Sensor
-from companion.sensors.estop import EstopSwitch
 from companion.sensors.flow_meter import FlowMeter
 
 _BROKEN = "not measured: it was broken off"

@@ -40,14 +40,13 @@ from companion.cli.ground_tasks import (
 )
 from companion.cli.output_parts import build_link, load_with_kept
 from companion.cli.run import build_executor, component_options, training_mark
-from companion.cli.sensor_parts import build_sensors
+from companion.cli.sensor_parts import EstopSwitch, build_sensors
 from companion.config import Config
 from companion.errors import ActuatorError, JournalError
 from companion.ground import shell
 from companion.ground.shell import GroundLink, GroundOutcome
 from companion.ground.work import HOLD_S, GroundDecision, GroundKind, GroundReason, GroundTask, Hold
 from companion.ports import Sensor
-from companion.sensors.estop import EstopSwitch
 
 # -------------------------------------------------------------------------------- one piece of work
 

@@ -10,10 +10,9 @@ from typing import Any
 
 import pytest
 
-from companion.cli.sensor_parts import GpiodLevel, build_sensors
+from companion.cli.sensor_parts import EstopSwitch, GpiodLevel, build_sensors
 from companion.core.types import EstopReport
 from companion.errors import SensorError
-from companion.sensors.estop import EstopSwitch
 from tests.companion.test_sensors_wiring import EXAMPLE, load
 
 
