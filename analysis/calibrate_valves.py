@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from companion.core.types import Input
     from companion.ground.shell import GroundLink, GroundOutcome
     from companion.ground.work import GroundDecision, GroundTask
-    from companion.sensors.flow_meter import EdgeSource, Meter
+    from companion.sensors import EdgeSource, Meter
 
 # Options of what is measured by pieces of ground work.
 ConfigFile = Annotated[
@@ -85,7 +85,7 @@ class PulseRecorder:
     """
 
     def __init__(self, meter: Meter, source: EdgeSource) -> None:
-        from companion.sensors.flow_meter import PulseCounter
+        from companion.sensors import PulseCounter
 
         self._counter, self._source = PulseCounter(meter), source
         self.time_s: list[float] = []

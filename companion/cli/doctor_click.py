@@ -36,7 +36,7 @@ from companion.ground.work import (
     flow_of,
 )
 from companion.ports import Sensor
-from companion.sensors.flow_meter import FlowMeter
+from companion.sensors import FlowMeter
 
 _BROKEN = "not measured: it was broken off"
 _LEFT_OUT = "left out by the operator"

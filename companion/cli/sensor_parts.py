@@ -20,8 +20,17 @@ from companion.errors import SensorError
 from companion.link.vehicle_link import VehicleLink
 from companion.output.engine.lines import find_chip, load_gpiod
 from companion.ports import Sensor
-from companion.sensors.flow_meter import Edge, EdgeSource, FlowMeter, Meter
-from companion.sensors.voltage import CurrentLoop, Gauge, I2cVoltage, IioVoltage, VoltageSource
+from companion.sensors import (
+    CurrentLoop,
+    Edge,
+    EdgeSource,
+    FlowMeter,
+    Gauge,
+    I2cVoltage,
+    IioVoltage,
+    Meter,
+    VoltageSource,
+)
 
 # ----------------------------------------------------------------------------------------- the stop
 

@@ -14,7 +14,7 @@ import pytest
 from companion.cli.sensor_parts import PressureSensor, TankSensor
 from companion.core.types import PressureReport, TankReport
 from companion.errors import SensorError
-from companion.sensors.voltage import CurrentLoop, Gauge, I2cVoltage, IioVoltage
+from companion.sensors import CurrentLoop, Gauge, I2cVoltage, IioVoltage
 
 LOOP = CurrentLoop(name="pressure", shunt_ohm=100.0, at_4_ma=0.0, at_20_ma=1000.0)
 
@@ -165,7 +165,7 @@ async def test_a_bus_that_hangs_does_not_delay_the_end() -> None:
 async def test_a_bus_that_hangs_from_the_beginning_is_said_and_left(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("companion.sensors.voltage.OPEN_MAX_S", 0.05)
+    monkeypatch.setattr("companion.sensors.OPEN_MAX_S", 0.05)
     source = HangingBus(hangs=True)
     made = Gauge(LOOP, source, rate_hz=200.0, window_s=0.3)
     try:

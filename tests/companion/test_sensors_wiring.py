@@ -20,7 +20,7 @@ from companion.errors import ConfigError, SensorError
 from companion.link.codec import FROM_VEHICLE
 from companion.link.streams import wanted_streams
 from companion.ports import Sensor
-from companion.sensors.flow_meter import FlowMeter
+from companion.sensors import FlowMeter
 from missions.maps.compiling import compiled_setup
 from tests.builders import position, setup
 

@@ -13,7 +13,7 @@ from companion.cli import sensor_parts
 from companion.cli.sensor_parts import GpiodEdges, GpiodLevel
 from companion.errors import SensorError
 from companion.output.engine.lines import GpiodLines, load_gpiod
-from companion.sensors.flow_meter import FlowMeter, Meter
+from companion.sensors import FlowMeter, Meter
 from tests.gpio.sim import SimChip
 
 pytestmark = pytest.mark.needs_gpiosim

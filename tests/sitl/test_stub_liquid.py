@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.errors import ConfigError
-from companion.sensors.voltage import CurrentLoop, IioVoltage
+from companion.sensors import CurrentLoop, IioVoltage
 from sitl.liquid_faults import LiquidFaultKind, healthy_kpa
 from sitl.serve import ServeOptions, serve
 from sitl.stub.outputs import ServoOrder

@@ -35,7 +35,7 @@ from companion.core.types import BatteryReport, Input
 from companion.ground.shell import GroundOutcome
 from companion.ground.work import PIECE_MAX_S, GroundReason, GroundTask
 from companion.link.component import Component, ComponentOptions
-from companion.sensors.flow_meter import Meter, VirtualEdges
+from companion.sensors import Meter, VirtualEdges
 from sitl.flight import FlightOptions
 from sitl.profile import Imperfections, Parts, PlantProfile, draw_scatter, load_profile
 from sitl.stub.sprayer import FLIGHT_BATTERY, Battery
