@@ -22,8 +22,6 @@ TOOL = ROOT / ".venv" / "mutmut"
 SOURCES = (
     "companion/core/safety.py",
     "companion/output/engine/engine.py",
-    "companion/output/engine/engine.py",
-    "companion/output/pwm.py",
     "companion/output/pwm.py",
     "companion/output/return_valve.py",
     "companion/output/timed.py",
