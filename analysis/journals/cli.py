@@ -18,8 +18,9 @@ from companion.cli.answer import AsJson, answer
 from companion.cli.flights import FAILED, ConfigFile, Folder, as_object, line_of, place_of
 from companion.errors import JournalError, UnreadableError
 from companion.journal.folder import look_at
-from companion.journal.read_only import DAMAGE, SEE_SHOW, OtherVersionError, one_line
+from companion.journal.read_only import DAMAGE, one_line
 from companion.journal.reader import OpenJournal, damaged_pages, opened, readable_rows
+from companion.journal.versions import SEE_SHOW, OtherVersionError
 from companion.journal.writer import missing_rows
 from companion.wording import counted
 

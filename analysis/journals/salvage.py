@@ -32,7 +32,6 @@ from companion.journal.read_only import (
     columns_of,
     empty_tables,
     known_tables,
-    missing_tables,
     one_line,
     own_tables,
     read_only,
@@ -40,6 +39,7 @@ from companion.journal.read_only import (
 )
 from companion.journal.reader import readable_rows, tolerate_damage
 from companion.journal.recovery import Recovery, Told
+from companion.journal.versions import missing_tables
 from companion.journal.writer import LITRES_KEY, SET_META, applied_l
 
 # Without a row of any of these a file is no journal, or nothing of one.

@@ -17,17 +17,19 @@ from companion.journal.geopackage import APPLICATION_ID, RESERVE, read_ground
 from companion.journal.read_only import (
     DAMAGE,
     allow_damaged_list,
+    check_programs,
+    log_of,
+    one_line,
+    read_only,
+)
+from companion.journal.versions import (
     as_far_as_said,
     check_kind,
-    check_programs,
     check_said,
     check_version,
     extent,
-    log_of,
     migrated,
     no_file,
-    one_line,
-    read_only,
     refused,
     why_no_setup,
 )

@@ -21,10 +21,8 @@ from companion.journal.folder import journals
 from companion.journal.geopackage import APPLICATION_ID, box_of_points, set_box
 from companion.journal.read_only import (
     DAMAGE,
-    OtherVersionError,
     check_beside,
     check_programs,
-    check_version,
     distrust,
     kept_log_of,
     log_of,
@@ -32,6 +30,7 @@ from companion.journal.read_only import (
     read_only,
     salvaged_name,
 )
+from companion.journal.versions import OtherVersionError, check_version
 from companion.journal.writer import SET_META, tell_times_again, totals_of
 
 _KNOWN = "SELECT min(time_s) FROM events WHERE kind = 'clock'"
