@@ -1,4 +1,4 @@
-"""Inputs and decisions of a journal, back from packed blocks: the other half of `packing.py`."""
+"""Inputs and decisions of a journal, back from packed blocks: the other half of `rows.py`."""
 
 from __future__ import annotations
 
@@ -275,7 +275,7 @@ class Reader:
 
 
 def sums(words: Sequence[int]) -> list[int]:
-    """Return what `packing.differences` was given."""
+    """Return what `rows.differences` was given."""
     return list(accumulate([word >> 1 if not word & 1 else -((word + 1) >> 1) for word in words]))
 
 

@@ -2,7 +2,7 @@
 
 One class a table, one line a key. Unknown keys are refused and numbers are strict, so that a slip
 of the pen is never a setting. What must be measured on the sprayer has no default. How a file is
-read, and what is said of a wrong one, is in `load.py`. The tables of the sprayer itself, of the
+read, and what is said of a wrong one, is in `model.py`. The tables of the sprayer itself, of the
 corrections and of the sensors have files of their own.
 """
 

@@ -213,7 +213,7 @@ def _failed(named: str, reason: str) -> MapError:
 
 # Which files a map consists of, by their bytes alone: nothing here looks into one.
 
-# As for any folder or file of a map (missions/maps/bundle.py, layer.py).
+# As for any folder or file of a map (missions/maps/bundle.py, model.py).
 _FILES_MAX = 2_000
 _BYTES_MAX = 1024 * 1024 * 1024
 _CHUNK_BYTES = 1 << 20

@@ -57,7 +57,7 @@ class StreamRequest:
 
 _RAW_SENSORS, _EXTENDED_STATUS, _RC_CHANNELS, _POSITION = 1, 2, 3, 6
 _EXTRA1, _EXTRA2, _EXTRA3 = 10, 11, 12
-# Ten times a second is the least that bridges two positions (core/inertial.py).
+# Ten times a second is the least that bridges two positions (core/options/inertial.py).
 IMU_RATE_MIN_HZ, IMU_RATE_MAX_HZ = 10.0, 20.0
 
 

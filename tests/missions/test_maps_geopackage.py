@@ -414,12 +414,12 @@ def test_work_without_end_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("limit", "value"),
     [
-        ("layer.MAX_RECORDS", 1),
-        ("layer.MAX_VERTICES", 14),
-        ("geopackage.layers._CELLS_MAX", 7),
-        ("geopackage.layers._COLUMNS_MAX", 3),
-        ("geopackage.layers._LAYERS_MAX", 0),
-        ("layer.MAX_FILE_BYTES", 10_000),
+        ("model.MAX_RECORDS", 1),
+        ("model.MAX_VERTICES", 14),
+        ("geopackage_layers._CELLS_MAX", 7),
+        ("geopackage_layers._COLUMNS_MAX", 3),
+        ("geopackage_layers._LAYERS_MAX", 0),
+        ("model.MAX_FILE_BYTES", 10_000),
     ],
 )
 def test_what_is_too_large_is_refused(

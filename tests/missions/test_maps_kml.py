@@ -457,11 +457,11 @@ def test_other_xml_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("limit", "value"),
     [
-        ("layer.MAX_RECORDS", 1),
-        ("layer.MAX_VERTICES", 7),
-        ("kml.reader._CELLS_MAX", 1),
-        ("kml.reader._COLUMNS_MAX", 0),
-        ("kml.geometry.MAX_VERTICES", 2),
+        ("model.MAX_RECORDS", 1),
+        ("model.MAX_VERTICES", 7),
+        ("kml._CELLS_MAX", 1),
+        ("kml._COLUMNS_MAX", 0),
+        ("kml_polygons.MAX_VERTICES", 2),
     ],
 )
 def test_what_is_too_large_is_refused(
