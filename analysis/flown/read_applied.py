@@ -36,9 +36,8 @@ from companion.core.setup import Setup
 from companion.core.types import Decision
 from companion.errors import UnreadableError
 from companion.journal.codec import FieldNames, decode, field_names_of
-from companion.journal.reader import OpenJournal, opened
+from companion.journal.reader import OpenJournal, migrated, opened
 from companion.journal.rows import ValveRows
-from companion.journal.versions import migrated
 from companion.journal.writer import Event
 
 # Which rows of a journal's tables can be believed, row by row: the rest is left out and counted.

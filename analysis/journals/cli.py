@@ -19,8 +19,14 @@ from companion.cli.flights import FAILED, ConfigFile, Folder, as_object, line_of
 from companion.errors import JournalError, UnreadableError
 from companion.journal.folder import look_at
 from companion.journal.read_only import DAMAGE, one_line
-from companion.journal.reader import OpenJournal, damaged_pages, opened, readable_rows
-from companion.journal.versions import SEE_SHOW, OtherVersionError
+from companion.journal.reader import (
+    SEE_SHOW,
+    OpenJournal,
+    OtherVersionError,
+    damaged_pages,
+    opened,
+    readable_rows,
+)
 from companion.journal.writer import missing_rows
 from companion.wording import counted
 

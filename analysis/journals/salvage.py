@@ -37,9 +37,8 @@ from companion.journal.read_only import (
     read_only,
     salvaged_name,
 )
-from companion.journal.reader import readable_rows, tolerate_damage
+from companion.journal.reader import missing_tables, readable_rows, tolerate_damage
 from companion.journal.recovery import Recovery, Told
-from companion.journal.versions import missing_tables
 from companion.journal.writer import LITRES_KEY, SET_META, applied_l
 
 # Without a row of any of these a file is no journal, or nothing of one.

@@ -14,8 +14,7 @@ from pathlib import Path
 
 from companion.errors import JournalError
 from companion.journal.read_only import DAMAGE, kept_log_of, log_of, one_line
-from companion.journal.reader import OpenJournal, opened
-from companion.journal.versions import OtherVersionError
+from companion.journal.reader import OpenJournal, OtherVersionError, opened
 from companion.journal.writer import applied_l
 from companion.simulated import Simulated, simulated_in
 

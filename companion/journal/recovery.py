@@ -30,7 +30,7 @@ from companion.journal.read_only import (
     read_only,
     salvaged_name,
 )
-from companion.journal.versions import OtherVersionError, check_version
+from companion.journal.reader import OtherVersionError, check_version
 from companion.journal.writer import SET_META, tell_times_again, totals_of
 
 _KNOWN = "SELECT min(time_s) FROM events WHERE kind = 'clock'"

@@ -17,8 +17,7 @@ from analysis.journals.content import damages
 from companion.cli.app import execute
 from companion.errors import JournalError, UnreadableError
 from companion.journal.geopackage import PAGE_BYTES
-from companion.journal.reader import opened
-from companion.journal.versions import refused
+from companion.journal.reader import opened, refused
 from tests.builders import setup
 from tests.companion.test_coverage_journal import journal
 from tests.companion.test_journal import change

@@ -14,9 +14,8 @@ from companion.core.types import Decision, Telemetry
 from companion.errors import JournalError
 from companion.journal.codec import decode, encode
 from companion.journal.journal import Journal
-from companion.journal.reader import opened
+from companion.journal.reader import OtherVersionError, opened
 from companion.journal.rows import Block
-from companion.journal.versions import OtherVersionError
 from tests.builders import setup
 from tests.companion.test_journal import INPUTS, change, closed_journal
 

@@ -6,7 +6,7 @@ import sqlite3
 from contextlib import closing
 
 from companion.journal.geopackage import SCHEMA
-from companion.journal.versions import JOURNAL_VERSION
+from companion.journal.reader import JOURNAL_VERSION
 
 INTRODUCTION = f"""# Journal tables
 
