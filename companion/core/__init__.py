@@ -1,5 +1,6 @@
 """The pure core: no input, no output, no clock, no logging, no asyncio.
 
-Read it in the order of the data: `types`, `frame`, `estimator`, `boom`, `prescription`,
-`crossings`, `rate`, `nozzle`, `schedule`, `interlock`, `controller`.
+Read it in the order of the data: `inputs`, `types`, `setup`, `frame`; `positions`, `clock`,
+`motion`, `estimator`; `safety`; `prescription`, `cells`; `braking`, `boom`, `crossings`; `nozzle`,
+`schedule`; `controller`. What a flight may have and most do not is in `options`.
 """
