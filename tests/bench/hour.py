@@ -41,10 +41,10 @@ from sitl.fly import ON_INPUTS, with_faults
 from sitl.outputs import PlanFollower
 from sitl.profile import load_profile
 from sitl.stub.faults import Fault
-from sitl.studies.message_way import Way, sent_over
 from sitl.vehicle import Vehicle
 from tests.bench.fields import PROFILE, example
 from tests.bench.oracle import Oracle, open_under
+from tests.message_way import Way, sent_over
 
 SPEED_M_S = 5.0
 EVERY_S = 8.0  # between the starts of two faults, on average

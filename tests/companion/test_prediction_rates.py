@@ -15,9 +15,9 @@ from companion.core.types import ClockReport, Input, Telemetry
 from sitl.anyang import ACCELERATION_M_S2, START_S, demo_lags, demo_route, demo_setup
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile
-from sitl.studies.message_way import Way, sent_over
 from sitl.trajectory import Trajectory
 from sitl.vehicle import Vehicle
+from tests.message_way import Way, sent_over
 
 SPEED_M_S = 5.0
 SEED = 3
