@@ -14,8 +14,8 @@ from PIL import Image
 from analysis.wsp import cli
 from analysis.wsp.image import Rectangle
 from companion.cli.app import execute
-from sitl.studies.synthetic_cards import Scanner, Spray, draw_sheet, save
 from tests.analysis.test_wsp_flight import flown
+from tests.synthetic_cards import Scanner, Spray, draw_sheet, save
 
 DPI = 300.0
 PX = DPI / 25.4

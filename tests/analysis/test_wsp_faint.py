@@ -9,7 +9,7 @@ import pytest
 
 from analysis.wsp.corrected import by_peak, corrected, full_grey, with_faint
 from analysis.wsp.stains import DEPOSITSCAN, grey_of, segment
-from sitl.studies.synthetic_cards import Scanner, Spray, TrueSheet, draw_card
+from tests.synthetic_cards import Scanner, Spray, TrueSheet, draw_card
 
 MIST = Spray(drops_per_cm2=40.0, nmd_um=75.0, sigma=1.6)
 

@@ -12,7 +12,7 @@ import pytest
 from analysis.wsp.card import Card, Method, Reading, read_sheet
 from analysis.wsp.image import Sheet
 from analysis.wsp.results import density_class
-from sitl.studies.synthetic_cards import Scanner, Spray, draw_card
+from tests.synthetic_cards import Scanner, Spray, draw_card
 
 WHOLE = Reading(method=Method(inset_mm=0.0), whole=True)
 SPRAY = Spray(drops_per_cm2=20.0, nmd_um=180.0, sigma=1.3)

@@ -11,7 +11,7 @@ import pytest
 
 from analysis.wsp.card import INSET_MM, Method, Reading, SheetResult, read_sheet
 from analysis.wsp.image import Rectangle, Sheet, around, find_cards
-from sitl.studies.synthetic_cards import Scanner, Spray, TrueSheet, draw_card, draw_sheet
+from tests.synthetic_cards import Scanner, Spray, TrueSheet, draw_card, draw_sheet
 
 DPI = 300.0
 PX = DPI / 25.4

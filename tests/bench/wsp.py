@@ -23,7 +23,7 @@ import numpy as np
 from analysis.wsp.card import INSET_MM, Card, Method, Reading, SheetResult, read_sheet
 from analysis.wsp.image import sheets_of
 from analysis.wsp.stains import LEAST_DROP_UM
-from sitl.studies.synthetic_cards import Scanner, Spray, TrueSheet, a4_places, draw_sheet, save
+from tests.synthetic_cards import Scanner, Spray, TrueSheet, a4_places, draw_sheet, save
 
 CARDS = 10
 ENDINGS = ("png", "tif", "jpg")
