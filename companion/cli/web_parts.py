@@ -27,8 +27,8 @@ from companion.journal.journal import Journal
 from companion.link.vehicle_link import VehicleLink
 from companion.ports import Recorder
 from companion.web import Obey, OperatorPage, Order, Outcome, listen, map_object
-from companion.web.frames import number
 from companion.web.guard import Doors, Tokens, is_loopback, kept_tokens, new_tokens
+from companion.web.page import number
 from companion.wording import install_command
 
 TOKENS_NAME = "page-tokens.json"

@@ -6,7 +6,6 @@ only (`python -m companion.web`, started by `OperatorPage`).
 
 from __future__ import annotations
 
-from companion.web.frames import map_object
-from companion.web.page import Obey, OperatorPage, Order, Outcome, listen
+from companion.web.page import Obey, OperatorPage, Order, Outcome, listen, map_object
 
 __all__ = ["Obey", "OperatorPage", "Order", "Outcome", "listen", "map_object"]

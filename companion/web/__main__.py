@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from companion.web.entrance import Guarded, server_of
-from companion.web.frames import RingReader
 from companion.web.guard import Doors, Guard, Tokens
 from companion.web.live import Live
+from companion.web.page import RingReader
 from companion.web.parts import registered, uploads
 from companion.web.server import Orders, Site, build_app
 

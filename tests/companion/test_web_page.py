@@ -20,15 +20,6 @@ from companion.core.types import Inhibit, SprayerState
 from companion.errors import ConfigError
 from companion.link.component import Component, ComponentOptions
 from companion.web import OperatorPage, Order, Outcome, listen
-from companion.web.frames import (
-    PAYLOAD_MAX,
-    SLOTS,
-    RingReader,
-    RingWriter,
-    frame_of,
-    new_memory,
-    packed,
-)
 from companion.web.live import (
     ADVICE,
     Live,
@@ -39,7 +30,17 @@ from companion.web.live import (
     reasons_of,
     wanted_rate,
 )
-from companion.web.page import ORDER_BYTES_MAX, parse_order
+from companion.web.page import (
+    ORDER_BYTES_MAX,
+    PAYLOAD_MAX,
+    SLOTS,
+    RingReader,
+    RingWriter,
+    frame_of,
+    new_memory,
+    packed,
+    parse_order,
+)
 from companion.web.parts import Limits, run_child
 from tests.companion.web_site import SETUP, Site, about, aged, served, until
 
