@@ -18,7 +18,7 @@ from companion.core.boom import Boom, Valve
 from companion.core.nozzle import FlowCurve, NozzleSet
 from companion.core.schedule import LagModel
 from companion.core.types import PwmLimits
-from sitl.meter import BoardEdge
+from sitl.plant import BoardEdge
 from sitl.profile import draw_scatter, flow_table
 
 if TYPE_CHECKING:
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
     from companion.core.setup import Setup
     from companion.core.types import SprayPlan, TimedChange
-    from sitl.meter import Edge
     from sitl.outputs import Output, TakesDuties, TakesEdges
+    from sitl.plant import Edge
     from sitl.profile import PlantProfile, Pump, Scatter
 
 # Points by which a controller is told a law: straight between them it errs by less than 1e-4.

@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Literal, Protocol
 import numpy as np
 
 from companion.core.types import TimedChange
-from sitl.meter import BoardEdge
+from sitl.plant import BoardEdge
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from companion.core.types import SprayPlan
-    from sitl.meter import Edge
+    from sitl.plant import Edge
     from sitl.profile import PlantProfile, Pulsing
 
 # ----------------------------------------------------------------------------------- the servo path

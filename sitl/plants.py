@@ -17,8 +17,16 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from sitl.drives import Approach
-from sitl.meter import Metering, MeterStream, VolumeMeter
-from sitl.plant import AveragedPlant, Faults, Floats, Plant, PulsedPlant
+from sitl.plant import (
+    AveragedPlant,
+    Faults,
+    Floats,
+    Metering,
+    MeterStream,
+    Plant,
+    PulsedPlant,
+    VolumeMeter,
+)
 from sitl.section_plant import SectionPlant
 
 if TYPE_CHECKING:

@@ -6,15 +6,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sitl.meter import MeterStream, VolumeMeter
-from sitl.plant import Faults, Floats, Plant
+from sitl.plant import Faults, Floats, MeterStream, Plant, VolumeMeter
 from sitl.profile import ML_S_PER_L_MIN, flow_table
 from sitl.supply import Supply
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from sitl.meter import Edge
+    from sitl.plant import Edge
     from sitl.profile import PlantProfile
 
 

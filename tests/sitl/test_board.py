@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from sitl.meter import BoardEdge as Edge
 from sitl.outputs import DriverBoard
+from sitl.plant import BoardEdge as Edge
 from sitl.profile import Pulsing
 
 PWM = Pulsing(frequency_hz=11.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)

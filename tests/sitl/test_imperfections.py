@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from companion.errors import ConfigError
-from sitl.meter import BoardEdge as Edge
+from sitl.plant import BoardEdge as Edge
 from sitl.plant import PulsedPlant
 from sitl.profile import PROFILES, TYPICAL, Imperfections, Parts, PlantProfile, load_profile
 

@@ -7,9 +7,8 @@ from hypothesis import strategies as st
 from companion.core.types import SprayPlan, TimedChange
 from companion.output.pwm import PulseEngine, needs_restart
 from sitl.knowledge import pwm_limits
-from sitl.meter import BoardEdge
 from sitl.outputs import ValvePulses, phase_of
-from sitl.plant import AveragedPlant, Plant, PulsedPlant
+from sitl.plant import AveragedPlant, BoardEdge, Plant, PulsedPlant
 from sitl.profile import PlantProfile, load_profile
 
 PROFILES = tuple(load_profile(name) for name in ("wang-2024", "orchard-180"))
