@@ -9,11 +9,10 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from sitl.stub import commands, mission
-from sitl.stub.commands import ACCEPTED, DENIED, FAILED
+from sitl.stub import commands
+from sitl.stub.commands import ACCEPTED, DENIED, FAILED, current
 from sitl.stub.faults import FaultKind
 from sitl.stub.firmware import Builder, CommandHandler, Firmware, MessageHandler, Params, Version
-from sitl.stub.mission import current
 from sitl.stub.mission_items import LAND, LOITER, RTL, refused_by_ardupilot
 from sitl.stub.outputs import ServoOutputs
 from sitl.stub.protocol import Message, dialect
@@ -162,14 +161,14 @@ VERSION: Version = (4, 6, 0)
 MESSAGES: dict[str, MessageHandler] = {
     "COMMAND_LONG": commands.handle_long,
     "COMMAND_INT": commands.handle_int,
-    "MISSION_COUNT": mission.handle_count,
-    "MISSION_ITEM_INT": mission.handle_item,
-    "MISSION_ITEM": mission.handle_item,
-    "MISSION_REQUEST_LIST": mission.handle_list,
-    "MISSION_REQUEST_INT": mission.handle_request,
-    "MISSION_REQUEST": mission.handle_request,
-    "MISSION_CLEAR_ALL": mission.handle_clear,
-    "MISSION_SET_CURRENT": mission.handle_set_current,
+    "MISSION_COUNT": commands.handle_count,
+    "MISSION_ITEM_INT": commands.handle_item,
+    "MISSION_ITEM": commands.handle_item,
+    "MISSION_REQUEST_LIST": commands.handle_list,
+    "MISSION_REQUEST_INT": commands.handle_request,
+    "MISSION_REQUEST": commands.handle_request,
+    "MISSION_CLEAR_ALL": commands.handle_clear,
+    "MISSION_SET_CURRENT": commands.handle_set_current,
     "PARAM_REQUEST_LIST": commands.handle_parameter_list,
     "PARAM_REQUEST_READ": commands.handle_parameter_read,
     "PARAM_SET": commands.handle_parameter_set,

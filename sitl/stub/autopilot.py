@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from itertools import count
 from typing import Protocol
 
-from sitl.stub import actions, commands, mission
+from sitl.stub import actions, commands
 from sitl.stub.faults import Fault, FaultClock, FaultKind, rc_pulses_us
 from sitl.stub.firmware import Parts, Upload
 from sitl.stub.mission_items import AUTO, INFO, MissionItem
@@ -238,7 +238,7 @@ class Autopilot:
         actions.tell(self, now_s)
         self._update_outputs(now_s)
         self._run_script(now_s)
-        mission.tick(self, now_s)
+        commands.tick(self, now_s)
         self._beats.tick(self, now_s)
         self._acknowledgements.tick(self, now_s)
         for channel in list(self.channels):
@@ -330,7 +330,7 @@ class Beats:
         count, sequence = len(autopilot.flight.items), autopilot.flight.sequence
         if (count, sequence) != self._current[:2] or now_s - self._current[2] >= _CURRENT_S:
             self._current = (count, sequence, now_s)
-            autopilot.broadcast(mission.current(autopilot))
+            autopilot.broadcast(commands.current(autopilot))
 
 
 # COMMAND_ACK: once, late, twice, in two steps or not at all, as the faults will have it.
