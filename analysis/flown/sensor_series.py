@@ -1,6 +1,6 @@
 """What a journal's sensors said, as series: of its inputs only these are decoded.
 
-A block keeps each number's column and what of it is new (`companion/journal/packing.py`). Who wants
+A block keeps each number's column and what of it is new (`companion/journal/rows.py`). Who wants
 the count of a meter, fifty times a second, needs neither the lines of JSON nor the other kinds: of
 a sound block only the wanted columns are read, all of a column at once.
 """
@@ -34,7 +34,7 @@ from analysis.journals.unpacking import (
     span_text,
 )
 from companion.core.label import from_deg
-from companion.journal.packing import ANCHORED, BACK, BITS, FLOAT, NEW, SAME, Key, keys_of
+from companion.journal.rows import ANCHORED, BACK, BITS, FLOAT, NEW, SAME, Key, keys_of
 
 if TYPE_CHECKING:
     from analysis.journals.unpacking import Entry

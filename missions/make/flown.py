@@ -200,9 +200,9 @@ def written(
 
 def draw_picture(map_file: MapFile, path: Path, *, title: str) -> None:
     """Draw the map that was made."""
-    from missions.maps.picture import draw  # matplotlib, which not everybody has
+    from missions.maps import picture
 
-    draw(map_file, path, title=title)
+    picture(map_file, path, title=title)
 
 
 def check_rate(rate_l_ha: float, limits: Limits, *, said: str) -> None:
