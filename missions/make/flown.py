@@ -200,9 +200,9 @@ def written(
 
 def draw_picture(map_file: MapFile, path: Path, *, title: str) -> None:
     """Draw the map that was made."""
-    from missions.maps import picture
+    from missions.maps.picture import draw  # matplotlib, which not everybody has
 
-    picture(map_file, path, title=title)
+    draw(map_file, path, title=title)
 
 
 def check_rate(rate_l_ha: float, limits: Limits, *, said: str) -> None:

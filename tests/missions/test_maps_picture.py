@@ -17,11 +17,10 @@ from pyproj import CRS
 from shapely import MultiPolygon, Polygon, box
 
 from companion.errors import MapError
-from missions.maps import picture
 from missions.maps.build import frame_for
 from missions.maps.convert.rasterise import metres_per_degree
 from missions.maps.model import MapCells, MapFile, MapZone
-from missions.maps.picture import DPI, _bounds_m, printable, scale_length_m, sheet_for
+from missions.maps.picture import DPI, _bounds_m, draw, printable, scale_length_m, sheet_for
 from missions.maps.picture_ground import Colours
 from missions.maps.totals import as_sprayed
 
@@ -68,7 +67,7 @@ class Picture:
     """A drawn map, asked for the colour at metres from the origin of its degrees."""
 
     def __init__(self, map_file: MapFile, path: Path) -> None:
-        picture(map_file, path, title="field")
+        draw(map_file, path, title="field")
         self.pixels: NDArray[np.float64] = imread(BytesIO(path.read_bytes()), format="png")
         sprayed = as_sprayed(map_file)
         self._frame = frame_for(sprayed)
@@ -195,7 +194,7 @@ def test_the_scale_is_a_round_length_of_use(width_m: float) -> None:
 def test_the_same_map_makes_the_same_file(tmp_path: Path, suffix: str) -> None:
     source = a_map([(HOLED, 20.0)], boundary=MultiPolygon([box(-5, -5, 105, 65)]))
     for name in ("one", "two"):
-        picture(source, tmp_path / f"{name}{suffix}", title="t")
+        draw(source, tmp_path / f"{name}{suffix}", title="t")
     one, two = sorted(tmp_path.iterdir())
     assert one.read_bytes() == two.read_bytes()
     start = {".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF-"}[suffix]
@@ -204,7 +203,7 @@ def test_the_same_map_makes_the_same_file(tmp_path: Path, suffix: str) -> None:
 
 @pytest.mark.parametrize("title", ["处方图.shp", "a$b_{2}^", "x" * 500, "", "a\tb\x07"])
 def test_any_title_is_drawn_without_a_warning(tmp_path: Path, title: str) -> None:
-    picture(a_map([(HOLED, 20.0)]), tmp_path / "map.png", title=title)
+    draw(a_map([(HOLED, 20.0)]), tmp_path / "map.png", title=title)
     assert (tmp_path / "map.png").stat().st_size > 5000
 
 
@@ -215,19 +214,19 @@ def test_letters_that_the_font_lacks_are_named_by_number() -> None:
 
 @pytest.mark.parametrize("rate", [0.0, None, 20.0])
 def test_a_map_of_one_kind_is_drawn(tmp_path: Path, rate: float | None) -> None:
-    found = picture(a_map([(HOLED, rate)]), tmp_path / "map.png", title="t")
+    found = draw(a_map([(HOLED, rate)]), tmp_path / "map.png", title="t")
     assert found.rates_l_ha.tolist() == ([] if rate is None else [rate])
 
 
 def test_the_totals_are_those_of_the_legend(tmp_path: Path) -> None:
-    found = picture(a_map([(box(0, 0, 100, 50), 20.0)]), tmp_path / "map.png", title="t")
+    found = draw(a_map([(box(0, 0, 100, 50), 20.0)]), tmp_path / "map.png", title="t")
     assert found.area_ha == pytest.approx(0.5, rel=1e-4)
     assert found.all_litres == pytest.approx(10.0, rel=1e-4)
 
 
 def test_other_kinds_of_file_are_refused(tmp_path: Path) -> None:
     with pytest.raises(MapError, match=r"\.png, \.svg, \.pdf") as caught:
-        picture(a_map([(HOLED, 20.0)]), tmp_path / "map.jpeg", title="t")
+        draw(a_map([(HOLED, 20.0)]), tmp_path / "map.jpeg", title="t")
     assert caught.value.code == "unknown-format"
     assert list(tmp_path.iterdir()) == []
 
@@ -237,11 +236,11 @@ def test_without_matplotlib_the_extra_is_named(
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
     with pytest.raises(MapError, match=r"pip install 'vrspray\[office\]'") as caught:
-        picture(a_map([(HOLED, 20.0)]), tmp_path / "map.png", title="t")
+        draw(a_map([(HOLED, 20.0)]), tmp_path / "map.png", title="t")
     assert caught.value.code == "missing-library"
 
 
 def test_a_folder_that_is_not_there_is_an_error_and_no_traceback(tmp_path: Path) -> None:
     with pytest.raises(MapError) as caught:
-        picture(a_map([(HOLED, 20.0)]), tmp_path / "none" / "map.png", title="t")
+        draw(a_map([(HOLED, 20.0)]), tmp_path / "none" / "map.png", title="t")
     assert caught.value.code == "not-written"

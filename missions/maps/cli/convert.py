@@ -340,10 +340,10 @@ def _anywhere(result: dict[str, Any]) -> list[str]:
 @reading_options
 def show(file: File, reading: Reading, out: _Picture, as_json: AsJson = False) -> None:
     """Draw a map: its rates with a legend, north and a scale."""
-    from missions.maps import picture
+    from missions.maps.picture import draw
 
     source = reading.read(file)
-    drawn = picture(source, out, title=file.name)
+    drawn = draw(source, out, title=file.name)
     result: dict[str, Any] = {
         "in": str(file),
         "out": str(out),
