@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
@@ -49,12 +50,18 @@ def registered(under: str = "") -> dict[str, EntryPoint]:
     With `under` those that stand below a command of ours: `flights.show` is `show` of `flights`.
     """
     found: dict[str, EntryPoint] = {}
-    for point in entry_points(group=GROUP):
+    for point in _points():
         group, _, name = point.name.rpartition(".")
         # Whose it is takes long to read, and matters only where two name the same one.
         if group == under and (name not in found or _is_ours(point)):
             found[name] = point
     return dict(sorted(found.items()))
+
+
+@cache
+def _points() -> tuple[EntryPoint, ...]:
+    # Looks through all that is installed: a command asks several times who is there.
+    return tuple(entry_points(group=GROUP))
 
 
 def _is_ours(point: EntryPoint) -> bool:

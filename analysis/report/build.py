@@ -18,12 +18,13 @@ import subprocess
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import shapely
-from jinja2 import Environment, StrictUndefined
+from jinja2 import Environment, StrictUndefined, Template
 from markupsafe import Markup
 
 from analysis.assess.assessment import Assessment, Figures, assess, figures_of
@@ -202,10 +203,6 @@ NOTHING = "-"
 
 def page_of(contents: Mapping[str, Any], figures: Mapping[str, Mapping[str, str]]) -> str:
     """Return the page; `figures` has title, caption and markup (HTML) by name."""
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=False, keep_trailing_newline=True
-    )
-    environment.filters |= FILTERS
     shown = {name: {**each, "markup": Markup(each["markup"])} for name, each in figures.items()}
     values = {
         **contents,
@@ -219,7 +216,17 @@ def page_of(contents: Mapping[str, Any], figures: Mapping[str, Mapping[str, str]
         "speeds_text": _speeds_text(contents),
         "figures": _Absent(shown),
     }
-    return environment.from_string(_text_of("page.html.j2")).render(values).lstrip()
+    return _template().render(values).lstrip()
+
+
+@cache
+def _template() -> Template:
+    # Compiling it takes a third of a report's time: once, where many are made.
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=False, keep_trailing_newline=True
+    )
+    environment.filters |= FILTERS
+    return environment.from_string(_text_of("page.html.j2"))
 
 
 def _text_of(name: str) -> str:
