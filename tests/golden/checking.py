@@ -6,6 +6,7 @@ valves, inhibits and nozzle sets, with times within 1 us and all other numbers w
 
 from __future__ import annotations
 
+import json
 import lzma
 import math
 import platform
@@ -24,7 +25,7 @@ from analysis.replay import FlownCore
 from companion.core.setup import Setup
 from companion.core.types import Decision, Input
 from companion.journal import codec
-from companion.journal.codec import FieldNames, encode
+from companion.journal.codec import FieldNames, to_plain
 from companion.journal.coverage import read_coverage
 from companion.journal.reader import opened
 
@@ -109,7 +110,7 @@ def replayed(
         is_tolerant = not is_of_this_arithmetic(content.meta)
     flown = core(content.setup)
     beside.begin(content.setup)
-    has_same_text = _is_written_alike(content.field_names)
+    written = _written_then(content.field_names)
     decisions = differences = 0
     first, begin_s, is_left_out = None, None, False
     for entry in content.entries:
@@ -128,7 +129,7 @@ def replayed(
         decided = flown.decide(time_s)
         beside.compare(decided)
         # The same text is the same value to the bit, and is sooner compared.
-        if has_same_text and encode(decided) == _in_names_of_today(entry.body):
+        if written is not None and written(decided) == _in_names_of_today(entry.body):
             continue
         found = difference(content.value(entry), decided, is_tolerant=is_tolerant)
         if found is not None:
@@ -149,16 +150,42 @@ def replayed(
     )
 
 
-def _is_written_alike(then: FieldNames) -> bool:
-    """Return whether decisions had the fields of today, in that order."""
+def _written_then(then: FieldNames) -> Callable[[object], str] | None:
+    """Return what writes a value with the fields it had then; None where they were others.
+
+    Fields that came later stand behind those and are left out at their defaults, which is what they
+    are in a journal without them. With any other value they are written, and the text is another.
+    """
     was = {
         codec._RENAMED_TYPES.get(kind, kind): tuple(
             codec._RENAMED_FIELDS.get((kind, name), name) for name in names
         )
         for kind, names in then.items()
     }
-    kinds = codec._kept((Decision,))
-    return all(was.get(kind.__name__) == codec.FIELD_NAMES[kind.__name__] for kind in kinds)
+    kept: dict[type[Any], tuple[tuple[str, ...], dict[str, Any]]] = {}
+    for kind in codec._kept((Decision,)):
+        today = codec.FIELD_NAMES[kind.__name__]
+        had = was.get(kind.__name__, today)
+        if today[: len(had)] != had:
+            return None
+        later = {one.name: one.default for one in fields(kind) if one.name in today[len(had) :]}
+        kept[kind] = had, later
+
+    def plain(value: Any) -> object:
+        kind = type(value)
+        if kind is float or kind is str or kind is int or value is None:
+            return value
+        if kind is tuple:
+            return [plain(each) for each in value]
+        if kind not in kept:
+            return to_plain(value)
+        had, later = kept[kind]
+        names = had
+        if later and any(getattr(value, name) != is_not for name, is_not in later.items()):
+            names = (*had, *later)
+        return {kind.__name__: [plain(getattr(value, name)) for name in names]}
+
+    return lambda value: json.dumps(plain(value), separators=(",", ":"))
 
 
 def _in_names_of_today(text: str) -> str:

@@ -115,6 +115,12 @@ def other_flow(decision: Decision) -> Decision:
     return replace(decision, target_flow_l_min=decision.target_flow_l_min * (1.0 + 1e-8))
 
 
+def of_another_hour(decision: Decision) -> Decision:
+    """Change what came to the core after the flight was recorded."""
+    assert decision.state is not None
+    return replace(decision, state=replace(decision.state, utc_offset_s=1.0))
+
+
 def inhibited(decision: Decision) -> Decision:
     return replace(decision, inhibits=frozenset({Inhibit.LEAK}))
 
@@ -129,6 +135,7 @@ def inhibited(decision: Decision) -> Decision:
         (other_valve, "].valve", "].valve"),
         (other_flow, "target_flow_l_min", "target_flow_l_min"),
         (inhibited, "inhibits", "inhibits"),
+        (of_another_hour, "state.utc_offset_s", "state.utc_offset_s"),
     ],
 )
 def test_what_is_decided_otherwise_is_named(

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 
 from analysis.replay import FlownCore
-from companion.core.types import Decision, Input
+from companion.core.types import Decision, Input, TimedChange
 from tests.golden.checking import replayed, unpacked
 from tests.golden.test_golden import AT_A_LIMIT
-from tests.golden.time_shift import LENGTHS, OURS, UTC, OtherClocks, is_time
+from tests.golden.time_shift import LENGTHS, OURS, UTC, OtherClocks, is_alike, is_time
 
 
 def test_every_time_of_an_input_is_known_here() -> None:
@@ -32,3 +32,24 @@ def test_a_core_that_looks_at_the_clock_itself_is_noticed(monkeypatch: pytest.Mo
     with unpacked("ardupilot-cut") as path:
         replayed(path, beside=other)
     assert len(other.found) > AT_A_LIMIT
+
+
+@pytest.mark.parametrize(
+    ("change", "is_so"),
+    [
+        ({}, True),
+        ({"at_s": 8.0}, False),
+        ({"at_s": 9.0 + 2e-6}, False),
+        ({"duty": 0.5 + 2e-6}, False),
+        ({"valve": 3}, False),
+        ({"restart": False}, False),
+    ],
+)
+def test_what_moves_with_the_clock_and_nothing_else_is_alike(
+    change: dict[str, Any], is_so: bool
+) -> None:
+    here = TimedChange(at_s=8.0, valve=2, duty=0.5)
+    there = replace(here, **{"at_s": 9.0, **change})
+    assert is_alike((here, "a", None), (there, "a", None), 1.0) == is_so
+    assert not is_alike((here, None), (there, 0.0), 1.0)
+    assert not is_alike((here, here), (there,), 1.0)
