@@ -16,7 +16,7 @@ import numpy as np
 
 from companion.core.braking import CREEP_M_S, braking_begins_s
 from companion.core.frame import Floats, Offset
-from companion.core.motion import stretch
+from companion.core.motion import Turning, stretch
 from companion.core.types import StopAhead, VehicleState
 
 
@@ -110,6 +110,8 @@ def width_across_course_m(width_m: float, *, heading_deg: float, course_deg: flo
 # order looks ahead at most, a valve 2.5 m from the middle gains or loses up to 0.04 m.
 STRAIGHT_YAW_RATE_DEG_S = 3.0
 STRAIGHT_LATERAL_M_S2 = 1.0
+# From here on each valve is dosed by a speed of its own.
+STEADY_YAW_RATE_DEG_S = 1.0
 CURVE_CHORDS = 6
 # Knots of a path nearer than this are one.
 KNOTS_APART_S = 1e-3
@@ -144,8 +146,8 @@ def predict(
 ) -> Paths:
     """Return the paths of points of the boom from `back_s` ago to `ahead_s` from now.
 
-    The same motion as `estimator.estimate`: constant velocity plus a fading acceleration, and a
-    constant yaw rate; on a straight path that ends in a stop, the braking before it.
+    The same motion as `estimator.estimate`: constant velocity plus a fading acceleration, in the
+    turn of the nose as well; on a straight path that ends in a stop, the braking before it.
     """
     heading_deg = state.heading_deg if state.heading_deg is not None else 0.0
     speed = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
@@ -155,9 +157,9 @@ def predict(
             state.velocity_east_m_s * state.acceleration_north_m_s2
             - state.velocity_north_m_s * state.acceleration_east_m_s2
         ) / speed
-    turning = not (
-        abs(state.yaw_rate_deg_s) < STRAIGHT_YAW_RATE_DEG_S and abs(lateral) < STRAIGHT_LATERAL_M_S2
-    )
+    yaw = turning_of(state)
+    is_straight = yaw.fastest_deg_s < STRAIGHT_YAW_RATE_DEG_S
+    turning = not (is_straight and abs(lateral) < STRAIGHT_LATERAL_M_S2)
     chords = CURVE_CHORDS if turning else 1
     knots = [-back_s + (back_s + ahead_s) * i / chords for i in range(chords + 1)]
     if turning:
@@ -178,7 +180,7 @@ def predict(
         east, north, pace, middle = _straight(motions, heading_deg, right_m, forward_m)
     rights = []
     for a, b in pairwise(knots):
-        turned_deg = state.yaw_rate_deg_s * (a + b) / 2 if turning else 0.0
+        turned_deg = yaw.after((a + b) / 2)[0] if turning else 0.0
         angle = math.radians(heading_deg + turned_deg)
         rights.append((math.cos(angle), -math.sin(angle)))
     dx = east[:, 1:] - east[:, :-1]
@@ -194,6 +196,28 @@ def predict(
         step_north_m=dy,
         length_m=np.hypot(dx, dy),
     )
+
+
+def turning_of(state: VehicleState) -> Turning:
+    """Return how the nose turns."""
+    return Turning(state.yaw_rate_deg_s, state.yaw_gain_deg_s2)
+
+
+def speed_shares(state: VehicleState, boom: Boom, dt_s: float) -> list[float]:
+    """Return how fast each valve goes `dt_s` from now, beside the position reference."""
+    turned_deg, yaw = turning_of(state).after(dt_s)
+    if not yaw.fastest_deg_s > STEADY_YAW_RATE_DEG_S:
+        return [1.0] * len(boom.right_m)
+    ae, an = state.acceleration_east_m_s2, state.acceleration_north_m_s2
+    east, north, _, _ = _carried(state, dt_s, ae, an)
+    angle = math.radians((state.heading_deg or 0.0) + turned_deg)
+    sin, cos, rate = math.sin(angle), math.cos(angle), math.radians(yaw.rate_deg_s)
+    pace = np.hypot(
+        east + rate * (boom.forward_m * cos - boom.right_m * sin),
+        north - rate * (boom.right_m * cos + boom.forward_m * sin),
+    )
+    found: list[float] = (pace / max(math.hypot(east, north), 1e-3)).tolist()
+    return found
 
 
 def place_velocity(state: VehicleState) -> tuple[float, float]:
@@ -297,14 +321,15 @@ def _knot(
     """
     ae, an = state.acceleration_east_m_s2, state.acceleration_north_m_s2
     velocity_east, velocity_north, middle_east, middle_north = _carried(state, dt_s, ae, an)
-    angle = math.radians(heading_deg + state.yaw_rate_deg_s * dt_s)
+    turned_deg, yaw = turning_of(state).after(dt_s)
+    angle = math.radians(heading_deg + turned_deg)
     sin, cos = math.sin(angle), math.cos(angle)
     offset_east = right_m * cos + forward_m * sin
     offset_north = forward_m * cos - right_m * sin
     east, north, pace = into
     east[:, column] = middle_east + offset_east
     north[:, column] = middle_north + offset_north
-    yaw_rate = math.radians(state.yaw_rate_deg_s)
+    yaw_rate = math.radians(yaw.rate_deg_s)
     pace[:, column] = np.hypot(
         velocity_east + yaw_rate * offset_north, velocity_north - yaw_rate * offset_east
     )

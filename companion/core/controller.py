@@ -13,12 +13,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
-from companion.core.boom import Intervals, Paths
+from companion.core.boom import Intervals, Paths, speed_shares
 from companion.core.crossings import NO_ROUTES, KnownRoutes, Route, carried_on, find_routes
 from companion.core.frame import Offset
 from companion.core.nozzle import (
     NozzleSet,
     SetOfRate,
+    acts_after_s,
     dosing_by_valve,
     dosing_of,
     flow_for_rate,
@@ -342,6 +343,7 @@ def _orders(
 
     dosing = dosing_by_valve(nozzle_sets, index, set_of_rate, dose)
     soon_m_s = speed_soon(setup, state, speed_m_s)
+    shares = speed_shares(state, setup.boom, acts_after_s(setup))
     overdrive = overdrive_of(setup, index)
     sticky_s = sticky_border_s(setup.border_buffer_m, speed_m_s)
     until_s = now_s + setup.lease_s
@@ -353,8 +355,7 @@ def _orders(
     valves: list[ValveSchedule] = []
     before_key = None
     for valve, route in enumerate(own_routes):
-        # In a turn each valve has a speed of its own.
-        own = route[0].speed_m_s / speed_m_s if abs(state.yaw_rate_deg_s) > 1.0 else 1.0
+        own = shares[valve]
         of_valve = dosing(valve) if setup.pumping is None else on_off
         # Neighbours in the middle of one zone do the same.
         key = (route[0].rate_l_ha, own, in_force[valve], of_valve) if len(route) == 1 else None

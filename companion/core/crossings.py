@@ -29,6 +29,7 @@ from companion.core.boom import (
     place_velocity,
     predict,
     swept,
+    turning_of,
 )
 from companion.core.frame import Floats, Ints, Offset
 from companion.core.prescription import FIELD, SLIVER_M, Prescription
@@ -530,7 +531,7 @@ def _shift(
 ) -> tuple[float, float, float] | None:
     """Return how far along, how fast then and how fast now; None where the prediction fails."""
     age_s = now_s - before.time_s
-    turning = max(abs(before.yaw_rate_deg_s), abs(state.yaw_rate_deg_s))
+    turning = max(turning_of(before).fastest_deg_s, turning_of(state).fastest_deg_s)
     if not (0.0 <= age_s <= ROUTES_KEPT_S and turning < STRAIGHT_YAW_RATE_DEG_S):
         return None
     went_east, went_north = place_velocity(before)

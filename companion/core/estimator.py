@@ -32,12 +32,14 @@ from companion.core.motion import (
     MANOEUVRE,
     NOT_DRAWN,
     SHARE_MIN,
+    STEADY,
     Axis,
     Belief,
     Drawn,
     Pair,
     Seen,
     Told,
+    Turning,
     agreed,
     doubted,
     drawn_after,
@@ -115,7 +117,7 @@ class Motion(NamedTuple):
     seen: tuple[Seen, Seen]
     drawn: tuple[Drawn, Drawn]
     heading_deg: float | None
-    yaw_rate_deg_s: float
+    yaw: Turning
     height_m: float
     velocity_known: bool
     confirm_left: int
@@ -160,7 +162,7 @@ def begun(item: Telemetry, place: tuple[float, float], time_s: float) -> Motion:
         seen=(east, north),
         drawn=(NOT_DRAWN, NOT_DRAWN),
         heading_deg=item.heading_deg,
-        yaw_rate_deg_s=0.0,
+        yaw=STEADY,
         height_m=item.relative_altitude_m,
         velocity_known=east.velocity_m_s is not None,
         confirm_left=CONFIRM_COUNT,
@@ -199,7 +201,7 @@ def followed(before: Motion, item: Telemetry, place: tuple[float, float], time_s
             drawn_after(before.drawn[1], dt_s, before.seen[1], north),
         ),
         heading_deg=item.heading_deg,
-        yaw_rate_deg_s=turning(before.yaw_rate_deg_s, before.heading_deg, item.heading_deg, dt_s),
+        yaw=turning(before.yaw, before.heading_deg, item.heading_deg, dt_s),
         height_m=item.relative_altitude_m,
         velocity_known=known,
         confirm_left=max(before.confirm_left - 1, 0),
@@ -443,10 +445,10 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
     if motion is None:
         return None
     dt_s = now_s - motion.time_s
+    nose_deg, (turned_deg, yaw) = motion.heading_deg, motion.yaw.after(dt_s)
     east, north = _after(track.inertia, motion, dt_s)
     velocity_east, velocity_north = east.velocity_m_s, north.velocity_m_s
-    checked = _checked_speed(track, now_s)
-    known = motion.velocity_known
+    checked, known = _checked_speed(track, now_s), motion.velocity_known
     if not known and checked is not None:
         velocity_east, velocity_north, known = _reported_velocity(east, north, checked)
     heartbeat = track.heartbeat
@@ -462,8 +464,9 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         acceleration_fade_s=motion.acceleration_fade_s,
         outrun_east_m_s=east.outrun_m_s,
         outrun_north_m_s=north.outrun_m_s,
-        heading_deg=_heading(motion, dt_s),
-        yaw_rate_deg_s=motion.yaw_rate_deg_s,
+        heading_deg=None if nose_deg is None else (nose_deg + turned_deg) % 360.0,
+        yaw_rate_deg_s=yaw.rate_deg_s,
+        yaw_gain_deg_s2=yaw.gain_deg_s2,
         height_m=_height(track, motion, now_s),
         velocity_known=known,
         position_received_s=motion.received_s,
@@ -508,13 +511,6 @@ def _after(inertia: Inertia, motion: Motion, dt_s: float) -> tuple[Told, Told]:
         return east, north
     share = inertia.share
     return blended(east, by_inertia[0], share), blended(north, by_inertia[1], share)
-
-
-def _heading(motion: Motion, dt_s: float) -> float | None:
-    """Return where the nose will point."""
-    if motion.heading_deg is None:
-        return None
-    return (motion.heading_deg + motion.yaw_rate_deg_s * dt_s) % 360.0
 
 
 def _is_healthy(track: Track, now_s: float) -> bool | None:

@@ -21,6 +21,7 @@ last change says how it goes on.
 from __future__ import annotations
 
 from functools import lru_cache
+from math import copysign
 from typing import TYPE_CHECKING, NamedTuple
 
 from companion.core.arithmetic import (
@@ -68,7 +69,13 @@ EVIDENCE_MAX = 50.0
 # The longest time between messages that the filters bridge, and the finest step of their gains.
 BRIDGED_MAX_S = 2.0
 GAIN_STEP_S = 0.005
-YAW_RATE_TIME_S = 0.25
+# The nose: how fast a heading that was not foretold is believed, and how long an acceleration of
+# the turn lasts. Fitted to headings of ArduCopter where a pass begins and ends, 10 and 20 a second:
+# of the rate 0.3 s ahead 11 deg/s are wrong (rms), 19 without the acceleration.
+YAW_TIME_S = 0.07
+YAW_FADE_S = 0.3
+# No multicopter turns faster.
+YAW_RATE_MAX_DEG_S = 360.0
 # So many rounds stand for thousands of messages; most are there sooner.
 DOUBLINGS = 14
 SETTLED = 1e-12
@@ -544,14 +551,43 @@ def drawn_after(by: Drawn, dt_s: float, before: Seen, now: Seen) -> Drawn:
     return followed(by, dt_s, now.position_m - before.position_m, told_m_s)
 
 
+class Turning(NamedTuple):
+    """How the nose turns: its rate, and how fast that changes; the change fades."""
+
+    rate_deg_s: float
+    gain_deg_s2: float
+
+    def after(self, dt_s: float) -> tuple[float, Turning]:
+        """Return how far the nose has turned `dt_s` later [deg], and how it turns then."""
+        over = stretch(YAW_FADE_S, dt_s)
+        turned_deg = self.rate_deg_s * dt_s + self.gain_deg_s2 * over.carried_s2
+        rate_deg_s = self.rate_deg_s + self.gain_deg_s2 * over.gained_s
+        return turned_deg, Turning(rate_deg_s, self.gain_deg_s2 * over.kept)
+
+    @property
+    def fastest_deg_s(self) -> float:
+        """Return the fastest of now and later, without sign."""
+        return max(abs(self.rate_deg_s), abs(self.rate_deg_s + self.gain_deg_s2 * YAW_FADE_S))
+
+
+STEADY = Turning(0.0, 0.0)
+
+
 def turning(
-    before_deg_s: float, before_deg: float | None, heading_deg: float | None, dt_s: float
-) -> float:
-    """Return how fast the nose turns after one more heading."""
+    before: Turning, before_deg: float | None, heading_deg: float | None, dt_s: float
+) -> Turning:
+    """Return how the nose turns after one more heading."""
     if heading_deg is None or before_deg is None:
-        return 0.0
+        return STEADY
     if not abs(heading_deg - before_deg) <= 720.0:
-        return 0.0  # one of them is no number; the rate would never be one again
+        return STEADY  # one of them is no number; the rate would never be one again
     turned_deg = (heading_deg - before_deg + 180.0) % 360.0 - 180.0
-    share = 1.0 - exp(-dt_s / YAW_RATE_TIME_S)
-    return before_deg_s + share * (turned_deg / dt_s - before_deg_s)
+    foretold_deg, now = before.after(dt_s)
+    # Both are means over the time between the two headings.
+    off_deg_s = (turned_deg - foretold_deg) / dt_s
+    kept = exp(-dt_s / YAW_TIME_S)
+    rate_deg_s = now.rate_deg_s + (1.0 - kept * kept) * off_deg_s
+    gain_deg_s2 = now.gain_deg_s2 + (1.0 - kept) ** 2 / dt_s * off_deg_s
+    if not abs(rate_deg_s) <= YAW_RATE_MAX_DEG_S:
+        return Turning(copysign(YAW_RATE_MAX_DEG_S, rate_deg_s), 0.0)
+    return Turning(rate_deg_s, gain_deg_s2)

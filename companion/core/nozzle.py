@@ -395,9 +395,15 @@ def speed_soon(setup: Sprayer, state: VehicleState, speed_m_s: float) -> float:
     soon_m_s = max(speed_m_s + along * (gained_s + constant_s * left), 0.0)
     if state.stop_ahead is None:
         return soon_m_s
-    acts_s = timing.down_s + 0.5 * setup.pwm.period_s + TRIM_AGE_S
-    braked_m_s = speed_after(state.stop_ahead, speed_m_s, along, state.acceleration_fade_s, acts_s)
+    braked_m_s = speed_after(
+        state.stop_ahead, speed_m_s, along, state.acceleration_fade_s, acts_after_s(setup)
+    )
     return min(soon_m_s, braked_m_s)
+
+
+def acts_after_s(setup: Sprayer) -> float:
+    """Return when what is ordered now acts, in the mean: until then a valve follows its arc."""
+    return setup.timing.down_s + 0.5 * setup.pwm.period_s + TRIM_AGE_S
 
 
 # Which nozzle set sprays which zone: a change of set lies on the boundary, never inside a zone.

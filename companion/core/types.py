@@ -483,6 +483,7 @@ class VehicleState:
     # How much faster the place goes than the velocity by which it is dosed (`motion.py`).
     outrun_east_m_s: float = 0.0
     outrun_north_m_s: float = 0.0
+    yaw_gain_deg_s2: float = 0.0  # how fast the turn itself changes; it fades (`motion.py`)
     stop_ahead: StopAhead | None = None  # None: no mission is used, or it says of no stop
     horizontal_accuracy_m: float | None = None  # None: the receiver does not tell
     link_up: bool = True

@@ -10,11 +10,25 @@ import shapely
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from companion.core.boom import STRAIGHT_LATERAL_M_S2, STRAIGHT_YAW_RATE_DEG_S
+from companion.core.boom import (
+    STEADY_YAW_RATE_DEG_S,
+    STRAIGHT_LATERAL_M_S2,
+    STRAIGHT_YAW_RATE_DEG_S,
+    speed_shares,
+    turning_of,
+)
 from companion.core.crossings import find_routes
-from companion.core.motion import CRUISE
+from companion.core.estimator import Track, estimate, observe
+from companion.core.motion import (
+    CRUISE,
+    STEADY,
+    YAW_FADE_S,
+    YAW_RATE_MAX_DEG_S,
+    Turning,
+    turning,
+)
 from companion.core.prescription import Prescription, Zone
-from tests.builders import boom, flying
+from tests.builders import boom, flying, position, setup
 
 BEFORE_L_HA, AFTER_L_HA = 20.0, 25.0
 PLAIN = Prescription(
@@ -117,3 +131,82 @@ def test_the_outer_valve_of_a_turn_is_faster_and_the_straight_ones_are_alike() -
     assert right == sorted(right, reverse=True)
     assert right[0] - right[-1] == pytest.approx(math.radians(20.0) * 5.0, rel=0.02)
     assert speeds(0.0) == pytest.approx([5.0] * 6)
+
+
+TURN_S = 3.0
+
+
+def turn(at_s: float, fastest_deg_s: float) -> tuple[float, float]:
+    """Return heading and rate in a turn as copters fly it: it swells, and it dies away."""
+    part = 2.0 * math.pi * min(max(at_s, 0.0), TURN_S) / TURN_S
+    swept = (part - math.sin(part)) * TURN_S / (2.0 * math.pi)
+    return 80.0 + 0.5 * fastest_deg_s * swept, 0.5 * fastest_deg_s * (1.0 - math.cos(part))
+
+
+@pytest.mark.parametrize(("every_s", "share"), [(0.05, 0.72), (0.1, 0.74), (0.2, 0.95)])
+@pytest.mark.parametrize("fastest_deg_s", [60.0, -120.0])
+def test_a_turn_is_foretold_better_than_by_holding_what_it_is(
+    every_s: float, share: float, fastest_deg_s: float
+) -> None:
+    track, over = Track(), setup()
+    off, held = [], []
+    for i in range(round(3.6 / every_s) + 1):
+        at_s = i * every_s
+        heading_deg = turn(at_s, fastest_deg_s)[0] % 360.0
+        told = position(10.0 + at_s, 5.0 * at_s, 0.0, heading_deg=heading_deg)
+        track = observe(track, told, over)
+        state = estimate(track, 10.0 + at_s)
+        assert state is not None
+        turned_deg, later = turning_of(state).after(0.3)
+        then_deg, then_deg_s = turn(at_s + 0.3, fastest_deg_s)
+        now_deg, now_deg_s = turn(at_s, fastest_deg_s)
+        off.append((later.rate_deg_s - then_deg_s, turned_deg - (then_deg - now_deg)))
+        held.append((now_deg_s - then_deg_s, 0.3 * now_deg_s - (then_deg - now_deg)))
+    found, holding = (np.sqrt(np.mean(np.square(each), axis=0)) for each in (off, held))
+    # Who holds knows the true rate; what is told knows it only from headings.
+    assert (found < share * holding).all()
+
+
+@given(
+    rate_deg_s=st.floats(-90.0, 90.0),
+    gain_deg_s2=st.floats(-200.0, 200.0),
+    heading_deg=st.floats(0.0, 359.0),
+    ahead_s=st.floats(0.05, 0.4),
+)
+def test_a_valve_is_dosed_by_the_speed_that_it_has_then(
+    rate_deg_s: float, gain_deg_s2: float, heading_deg: float, ahead_s: float
+) -> None:
+    state = flying(
+        10.0, 0.0, heading_deg=heading_deg, yaw_rate_deg_s=rate_deg_s, yaw_gain_deg_s2=gain_deg_s2
+    )
+    speed_m_s = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
+    # The turn as it is meant: its change fades with YAW_FADE_S. Angles added up in small steps.
+    fine_s = ahead_s / 2000.0
+    times = (np.arange(2000) + 0.5) * fine_s
+    faded = YAW_FADE_S * (1.0 - np.exp(-times / YAW_FADE_S))
+    turned_deg = float(np.sum(rate_deg_s + gain_deg_s2 * faded) * fine_s)
+    then_deg_s = rate_deg_s + gain_deg_s2 * YAW_FADE_S * (1.0 - math.exp(-ahead_s / YAW_FADE_S))
+    last_deg_s = then_deg_s + gain_deg_s2 * YAW_FADE_S * math.exp(-ahead_s / YAW_FADE_S)
+    nose = math.radians(heading_deg + turned_deg)
+    spin = math.radians(then_deg_s)
+    shares = speed_shares(state, BOOM, ahead_s)
+    if max(abs(then_deg_s), abs(last_deg_s)) <= STEADY_YAW_RATE_DEG_S:
+        assert shares == [1.0] * 6
+        return
+    for valve, share in zip(BOOM.valves, shares, strict=True):
+        # Clockwise from north: what is ahead goes to the right, what is right goes back.
+        east = valve.right_m * math.cos(nose) + valve.forward_m * math.sin(nose)
+        north = valve.forward_m * math.cos(nose) - valve.right_m * math.sin(nose)
+        own = math.hypot(
+            state.velocity_east_m_s + spin * north, state.velocity_north_m_s - spin * east
+        )
+        assert share * speed_m_s == pytest.approx(own, abs=0.01)
+
+
+def test_a_heading_that_is_no_number_or_jumps_leaves_no_turn_beyond_what_can_be() -> None:
+    assert turning(Turning(20.0, 5.0), 80.0, math.nan, 0.1) == STEADY
+    assert turning(Turning(20.0, 5.0), None, 80.0, 0.1) == STEADY
+    for heading_deg in (0.0, 90.0, 179.0, 181.0, 359.0):
+        found = turning(STEADY, 0.0, heading_deg, 0.02)
+        assert abs(found.rate_deg_s) <= YAW_RATE_MAX_DEG_S
+        assert math.isfinite(found.gain_deg_s2)

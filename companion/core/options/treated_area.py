@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.core.boom import Boom
+from companion.core.boom import Boom, turning_of
 from companion.core.frame import Offset, Place
 from companion.core.options.coverage import Coverage, Quad
 from companion.core.schedule import LagModel
@@ -495,7 +495,7 @@ def expected(
         pose.time_s + carried_s,
         pose.east_m + state.velocity_east_m_s * carried_s,
         pose.north_m + state.velocity_north_m_s * carried_s,
-        pose.heading_deg + state.yaw_rate_deg_s * carried_s,
+        pose.heading_deg + turning_of(state).after(carried_s)[0],
     )
     ahead = ahead._replace(poses=tuple(poses), flow_edges=tuple(flow_edges))
     made = _stamped(settings.boom, ahead, end).coverage
