@@ -17,9 +17,9 @@ from companion.core.frame import LocalFrame
 from companion.core.inputs import AutopilotLiquid
 from companion.core.nozzle import NozzleSet, flow_for_rate
 from companion.core.options.atomisers import Atomiser
+from companion.core.options.flow_meter import BIN_S, UNSTEADY_SHARE, Detection
 from companion.core.options.flow_trim import FlowTrim
 from companion.core.options.lines import Lines
-from companion.core.options.liquid_evidence import BIN_S, UNSTEADY_SHARE, Detection
 from companion.core.options.overlap import OverlapGuard
 from companion.core.options.pump import Pump
 from companion.core.options.valve_tracking import ValveTracking

@@ -12,9 +12,9 @@ from companion.core.nozzle import NozzleSet, Sprayer
 from companion.core.options.atomisers import Atomiser
 from companion.core.options.coverage import Coverage
 from companion.core.options.drift import Drift
+from companion.core.options.flow_meter import Detection, Watching
 from companion.core.options.flow_trim import FlowTrim, Trimming
 from companion.core.options.lines import Lines
-from companion.core.options.liquid_evidence import Detection, Watching
 from companion.core.options.overlap import OverlapGuard
 from companion.core.options.pump import Pump, Pumping
 from companion.core.options.treated_area import Lags, TreatedAreaSettings

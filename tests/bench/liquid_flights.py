@@ -10,8 +10,8 @@ from typing import Literal
 
 import numpy as np
 
+from companion.core.options.flow_meter import Detection, Watching
 from companion.core.options.flow_trim import FlowTrim
-from companion.core.options.liquid_evidence import Detection, Watching
 from companion.core.options.liquid_faults import WatchMemory, follow
 from companion.core.setup import Setup
 from companion.core.types import Decision, FlowReport, PressureReport, SprayPlan, VehicleState

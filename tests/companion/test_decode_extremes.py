@@ -16,9 +16,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.core.controller import expected_coverage
 from companion.core.inputs import AutopilotLiquid
 from companion.core.options.drift import Drift
+from companion.core.options.flow_meter import Detection
 from companion.core.options.flow_trim import FlowTrim
 from companion.core.options.lines import Lines
-from companion.core.options.liquid_evidence import Detection
 from companion.core.setup import Setup
 from companion.core.types import SpeedReport, WindReport
 from companion.journal.codec import decode, encode

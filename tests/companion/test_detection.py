@@ -11,15 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.core.controller import Memory, Watched, step
+from companion.core.options.flow_meter import Detection, Order, Watching, bin_length_s
 from companion.core.options.flow_trim import FlowTrim
 from companion.core.options.liquid_evidence import (
     Bin,
     Collecting,
-    Detection,
     Evidence,
-    Order,
-    Watching,
-    bin_length_s,
     collected,
     expected_ml,
     name_of,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import pytest
 
 from companion.cli.sensor_parts import TankSensor, follow_refills
-from companion.core.options.liquid_evidence import Detection
+from companion.core.options.flow_meter import Detection
 from companion.core.types import FaultKind, Inhibit, TankReport
 from companion.link.component import ComponentOptions
 from companion.output.servo import ServoExecutor, ServoOptions

@@ -13,13 +13,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from companion.core.options.flow_meter import ML_S_PER_L_MIN, STALE_S
+from companion.core.options.flow_meter import ML_S_PER_L_MIN, STALE_S, Watching
 from companion.core.options.liquid_evidence import (
     LONGEST_BINS,
     Bin,
     Collecting,
     Evidence,
-    Watching,
     collected,
     heard,
     name_of,
