@@ -33,7 +33,7 @@ from missions.searching import lines_are_drawn
 from missions.sheet import scheduled
 from missions.sorties import Flying, SortieSearch
 from missions.spacing import Spacing
-from missions.speeds import choices, chosen, short_warnings, stretches_of
+from missions.speeds import choices, chosen, crawl_warnings, short_warnings, stretches_of
 from missions.stops import near_warnings, timed
 from missions.strips import (
     Bools,
@@ -184,6 +184,7 @@ def _planned(
         warnings=(
             *range_warnings(sorties.misses, field.frame, settings),
             *short_warnings(sorties.sorties, rates, field.frame, settings),
+            *crawl_warnings(flights, field.frame, settings),
             *far_warnings(sorties.sorties, places, field, has_battery=settings.battery is not None),
             *near_warnings(sorties.sorties, field.frame, apart=with_sprayer),
             *over_warnings(lines, field.limit, boom),

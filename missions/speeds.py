@@ -183,6 +183,9 @@ def between(leg: Leg, share: float) -> Place:
 READS = 4
 # On fields so large that this would be more places, nothing is said of short cells.
 PLACES_MAX = 2_000_000
+# A line with less than this part of the least flow is flown too slowly; worth a word from this part
+# of all lines on.
+CRAWLS, CRAWLED_SHARE = 0.9, 0.05
 # Under every valve while that is a second's work; else under the valve nearest to the middle.
 EVERY_VALVE_MAX = 250_000
 
@@ -223,6 +226,44 @@ def short_warnings(
         f"than {settings.settle_s:.2f} s, which a change of rate takes: the shortest is "
         f"{length_m:.1f} m at {leg.speed_m_s:g} m/s, sortie {number} near {place[0]:.6f}, "
         f"{place[1]:.6f}; fly slower, or make the cells longer",
+    )
+
+
+def crawl_warnings(
+    sorties: Sequence[Sortie], frame: LocalFrame, settings: Settings
+) -> tuple[str, ...]:
+    """Return how much is flown more slowly than the valves can follow, corner after corner.
+
+    An autopilot that plans each leg from rest to rest flies a row of short ones at walking pace,
+    whatever their speed. What a line takes on average counts, so that the slow ends of a long one
+    do not.
+    """
+    if settings.flow_l_min is None:
+        return ()
+    lines = [
+        leg for sortie in sorties for leg in sortie.legs
+        if leg.kind == "spray" and leg.seconds > 0.0 and leg.volume_l > 0.0
+    ]  # fmt: skip
+    low = settings.flow_l_min[0]
+    # What is too little at its own speed is told by `misses_of`.
+    slow = [
+        leg for leg in lines
+        if leg.volume_l / leg.seconds * 60.0 < CRAWLS * low
+        and leg.volume_l / leg.length_m * leg.speed_m_s * 60.0 >= low
+    ]  # fmt: skip
+    slow_m, all_m = (sum(leg.length_m for leg in some) for some in (slow, lines))
+    if not slow_m > CRAWLED_SHARE * all_m:
+        return ()
+    seconds, litres = sum(leg.seconds for leg in slow), sum(leg.volume_l for leg in slow)
+    worst = min(slow, key=lambda leg: (leg.length_m / leg.seconds, leg.points[0]))
+    latitude_deg, longitude_deg = frame.to_geographic(*worst.points[0])
+    over = 100.0 * (low * seconds / 60.0 / litres - 1.0)
+    return (
+        f"{math.ceil(slow_m)} m of passes are short and turn into each other: flown at "
+        f"{slow_m / seconds:.1f} m/s on average, where the nozzle sets give {over:.0f} % too much "
+        f"({low:.2f} L/min at least), or nothing below safety.speed_min_m_s; slowest near "
+        f"{latitude_deg:.6f}, {longitude_deg:.6f}; draw the border there with fewer corners, or "
+        f"try --leave-max 5",
     )
 
 

@@ -15,7 +15,7 @@ from missions.demand import Uniform
 from missions.files.items import CHANGE_SPEED, SPRAYER, items_of
 from missions.paced import paced
 from missions.plan import Leg, Plan, Settings, Sortie
-from missions.speeds import short_warnings, stretches_of
+from missions.speeds import crawl_warnings, short_warnings, stretches_of
 from missions.strips import Floats
 from tests.bench.missions import FRAME
 from tests.missions.test_missions_zero import Bare, planned
@@ -80,6 +80,45 @@ def test_too_low_a_rate_is_flown_faster_only_where_allowed() -> None:
 
 def test_without_a_sprayer_nothing_is_said() -> None:
     assert one_line(Bands((900.0,)), settings(flow_l_min=None))[1] == 0
+
+
+def crawling(short_s: float, *, rate_l_ha: float = 20.0, long_m: float = 100.0) -> Sortie:
+    """Return a long line at its speed, and ten short ones of 3 m that take `short_s` each."""
+    legs = [(long_m, long_m / 6.0), *[(3.0, short_s)] * 10]
+    return Sortie(
+        number=1,
+        depot=0,
+        legs=tuple(
+            Leg(
+                kind="spray", points=((0.0, 0.0), (0.0, length_m)), speed_m_s=6.0, seconds=seconds,
+                volume_l=rate_l_ha * WIDTH_M * length_m / 1e4,
+            )
+            for length_m, seconds in legs
+        ),
+    )  # fmt: skip
+
+
+def test_short_passes_that_are_flown_at_walking_pace_are_told_with_what_falls_there() -> None:
+    # 20 L/ha on 6 m at 1.2 m/s: 0.864 L/min, where the valves give 2.
+    (text,) = crawl_warnings([crawling(2.5)], FRAME, settings())
+    assert "30 m of passes" in text
+    assert "1.2 m/s" in text
+    assert "131 % too much (2.00 L/min at least)" in text
+
+
+@pytest.mark.parametrize(
+    ("short_s", "change"),
+    [
+        (1.0, {}),  # 3 m/s: within the range
+        (2.5, {"long_m": 900.0}),  # too few to matter
+        (2.5, {"rate_l_ha": 5.0}),  # too little at full speed already: told as that
+    ],
+)
+def test_nothing_is_told_of_passes_that_the_valves_can_follow_or_that_are_few(
+    short_s: float, change: dict[str, float]
+) -> None:
+    assert crawl_warnings([crawling(short_s, **change)], FRAME, settings()) == ()
+    assert crawl_warnings([crawling(2.5)], FRAME, settings(flow_l_min=None)) == ()
 
 
 bands = st.lists(st.sampled_from([0.0, 10.0, 20.0, 40.0, 70.0]), min_size=1, max_size=8)
