@@ -19,10 +19,10 @@ from pyproj import CRS
 
 from companion.errors import MapError
 from companion.wording import install_command
+from missions.maps.bundle import parse_xml
 from missions.maps.crs import parse_crs
 from missions.maps.geotiff_bands import RawBand, ReadBand, read_band
 from missions.maps.model import Affine, map_error
-from missions.maps.xmltree import parse_xml
 
 MAX_CELLS = 16_000_000
 MAX_BANDS = 64

@@ -20,7 +20,7 @@ from xml.sax.saxutils import escape
 import shapely
 from shapely import LinearRing, MultiPolygon, Polygon
 
-from missions.maps.bundle import Bundle, open_bundle
+from missions.maps.bundle import MAX_ELEMENTS, Bundle, open_bundle, parse_xml
 from missions.maps.crs import WGS84
 from missions.maps.fields import column_of, stated_unit
 from missions.maps.geopackage_layers import areas_of
@@ -38,7 +38,6 @@ from missions.maps.model import (
     read_bytes,
     write_whole,
 )
-from missions.maps.xmltree import MAX_ELEMENTS, parse_xml
 
 _CONTAINERS = ("kml", "Document", "Folder")
 

@@ -16,9 +16,8 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from companion.errors import MapError
-from missions.maps import bundle, xmltree
-from missions.maps.bundle import files_beside, open_bundle
-from missions.maps.xmltree import parse_xml
+from missions.maps import bundle
+from missions.maps.bundle import files_beside, open_bundle, parse_xml
 
 
 def zipped(path: Path, members: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> Path:
@@ -389,7 +388,7 @@ def test_depth_and_attributes_up_to_the_limit_are_read() -> None:
 
 
 def test_more_elements_than_any_map_has_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(xmltree, "MAX_ELEMENTS", 3)
+    monkeypatch.setattr(bundle, "MAX_ELEMENTS", 3)
     assert parsed("<a><b/><b/></a>")
     assert xml_refusal("<a><b/><b/><b/></a>").code == "too-large"
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from shapely import MultiPolygon, Polygon
 from shapely.errors import ShapelyError
 
-from missions.maps.bundle import Bundle, open_bundle
+from missions.maps.bundle import MAX_ELEMENTS, Bundle, open_bundle, parse_xml
 from missions.maps.crs import WGS84
 from missions.maps.isoxml.field import (
     CELLS_MAX,
@@ -57,7 +57,6 @@ from missions.maps.model import (
     digest,
     map_error,
 )
-from missions.maps.xmltree import MAX_ELEMENTS, parse_xml
 
 # ------------------------------------------------------------------------------ the files of a task
 
