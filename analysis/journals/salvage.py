@@ -14,7 +14,8 @@ from pathlib import Path
 from analysis.journals.stray_rows import KeptPages, kept_pages, stray_rows, torn_rows
 from companion.atomic_write import sync_folder
 from companion.core.frame import LocalFrame
-from companion.journal import recovery
+from companion.journal import folder
+from companion.journal.folder import Recovery, Told
 from companion.journal.geopackage import (
     APPLICATION_ID,
     JOURNAL_VERSION,
@@ -38,7 +39,6 @@ from companion.journal.read_only import (
     salvaged_name,
 )
 from companion.journal.reader import missing_tables, readable_rows, tolerate_damage
-from companion.journal.recovery import Recovery, Told
 from companion.journal.writer import LITRES_KEY, SET_META, applied_l
 
 # Without a row of any of these a file is no journal, or nothing of one.
@@ -254,12 +254,12 @@ def salvaged(path: Path, reason: str) -> Told:
 
 def recover_folder(folder: Path) -> list[Recovery]:
     """Recover every journal that was cut, and copy what can be read of a damaged one."""
-    return recovery.recover_folder(folder, salvaged)
+    return folder.recover_folder(folder, salvaged)
 
 
 def recover(path: Path) -> Recovery | None:
     """Recover one journal, or copy what can be read of it; None where there is nothing to do."""
-    return recovery.recover(path, salvaged)
+    return folder.recover(path, salvaged)
 
 
 # What a GeoPackage must have besides the flight's rows, written again where damage took it.

@@ -42,8 +42,7 @@ def made_ready(folder: Path, journal: JournalTable) -> Iterator[str]:
     if not folder.is_dir():
         return
     # Who has not flown yet has nothing to look after.
-    from companion.journal.folder import WARN_FREE_PERCENT, prune, space_of
-    from companion.journal.recovery import recover_folder
+    from companion.journal.folder import WARN_FREE_PERCENT, prune, recover_folder, space_of
 
     try:
         for found in recover_folder(folder):

@@ -67,7 +67,7 @@ NOT_OF_EVERY_FLIGHT = (
     "companion.link.signing", "companion.output.engine",
     "companion.output.gpio", "companion.output.hardware_pwm", "companion.journal.continuing",
     "companion.journal.leaf_page", "companion.journal.log", "companion.journal.reader",
-    "companion.journal.recovery", "companion.journal.folder", "companion.sensors",
+    "companion.journal.folder", "companion.journal.folder", "companion.sensors",
 )  # fmt: skip
 
 
