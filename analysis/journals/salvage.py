@@ -14,7 +14,7 @@ from pathlib import Path
 from analysis.journals.stray_rows import KeptPages, kept_pages, stray_rows, torn_rows
 from companion.atomic_write import sync_folder
 from companion.core.frame import LocalFrame
-from companion.journal import folder
+from companion.journal import folder as journal_folder
 from companion.journal.folder import Recovery, Told
 from companion.journal.geopackage import (
     APPLICATION_ID,
@@ -254,12 +254,12 @@ def salvaged(path: Path, reason: str) -> Told:
 
 def recover_folder(folder: Path) -> list[Recovery]:
     """Recover every journal that was cut, and copy what can be read of a damaged one."""
-    return folder.recover_folder(folder, salvaged)
+    return journal_folder.recover_folder(folder, salvaged)
 
 
 def recover(path: Path) -> Recovery | None:
     """Recover one journal, or copy what can be read of it; None where there is nothing to do."""
-    return folder.recover(path, salvaged)
+    return journal_folder.recover(path, salvaged)
 
 
 # What a GeoPackage must have besides the flight's rows, written again where damage took it.
