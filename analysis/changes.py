@@ -208,35 +208,66 @@ def bisect(holds: Callable[[Floats], Bools], low_s: Floats, high_s: Floats) -> F
 
 
 class _States:
-    """Numbers for what is under a track: in the field or not, and which zones."""
+    """Numbers for what is under tracks of one flight: in the field or not, and which zones."""
 
-    def __init__(self, track: Track, prescription: Prescription) -> None:
-        self.track = track
+    def __init__(self, tracks: Sequence[Track], prescription: Prescription) -> None:
+        self.tracks = tracks
         self.prescription = prescription
         self.lookup = lookup_of(prescription)
+        self._time_s = tracks[0].time_s
+        self._east_m = np.stack([track.east_m for track in tracks])
+        self._north_m = np.stack([track.north_m for track in tracks])
 
-    def at(self, places: Places) -> Ints:
-        """Return the number of the state under the strip's centre."""
-        inside = in_field(self.prescription, places.east_m, places.north_m)
-        index = np.flatnonzero(inside & self.track.on_line(places))
+    def at(self, time_s: Floats, east_m: Floats, north_m: Floats) -> Ints:
+        """Return the number of the state at places where the middles of strips are at a time."""
+        inside = in_field(self.prescription, east_m, north_m)
+        planned = self.tracks[0].planned
+        if planned is not None:
+            inside &= planned.flown(time_s, east_m, north_m)
+        index = np.flatnonzero(inside)
         states = np.full(len(inside), OUTSIDE)
-        states[index] = self.lookup.keys(places.east_m[index], places.north_m[index])
+        states[index] = self.lookup.keys(east_m[index], north_m[index])
         return states
 
-    def along(self, marked: Places) -> Ints:
-        """Return the states at all marks; where no edge is near, one of a piece says all."""
-        if self.track.planned is not None:
-            return self.at(marked)
-        count = len(marked.time_s)
-        asked = np.ones(count, dtype=np.bool_)
-        clear = np.flatnonzero(self.lookup.constant(marked.east_m, marked.north_m)) * PIECE
-        asked[(clear[:, np.newaxis] + np.arange(1, PIECE)).ravel()] = False
-        which = np.maximum.accumulate(np.where(asked, np.arange(count), 0))
-        numbers = np.cumsum(asked) - 1
-        found: Ints = self.at(marked.some(np.flatnonzero(asked)))[numbers[which]]
-        return found
+    def under(self, number: Ints, time_s: Floats) -> Ints:
+        """Return the states under tracks by their numbers, each at a time of its own."""
+        # As `Track.at` of each track, for all of them at once.
+        before = np.searchsorted(self._time_s, time_s, "right") - 1
+        before = np.clip(before, 0, len(self._time_s) - 2)
+        whole_s = self._time_s[before + 1] - self._time_s[before]
+        after_s = time_s - self._time_s[before]
+        places = []
+        for each in (self._east_m, self._north_m):
+            low, high = each[number, before], each[number, before + 1]
+            place = (high - low) / whole_s * after_s + low
+            places.append(np.where(time_s >= self._time_s[-1], each[number, -1], place))
+        return self.at(time_s, *places)
 
-    def run(self, state: int, start_s: float, end_s: float) -> Run:
+    def along(self) -> list[Ints]:
+        """Return the states at all marks; where no edge is near, one of a piece says all."""
+        marked = [track.marked() for track in self.tracks]
+        asked = [self._asked(each) for each in marked]
+        some = [each.some(np.flatnonzero(its)) for each, its in zip(marked, asked, strict=True)]
+        every = self.at(
+            np.concatenate([each.time_s for each in some]),
+            np.concatenate([each.east_m for each in some]),
+            np.concatenate([each.north_m for each in some]),
+        )
+        ends = np.cumsum([len(each.time_s) for each in some])
+        return [
+            states[np.cumsum(its) - 1]
+            for its, states in zip(asked, np.split(every, ends[:-1]), strict=True)
+        ]
+
+    def _asked(self, marked: Places) -> Bools:
+        """Return at which marks the state is looked up; at the others it is that of before."""
+        asked = np.ones(len(marked.time_s), dtype=np.bool_)
+        if self.tracks[0].planned is None:
+            clear = np.flatnonzero(self.lookup.constant(marked.east_m, marked.north_m)) * PIECE
+            asked[(clear[:, np.newaxis] + np.arange(1, PIECE)).ravel()] = False
+        return asked
+
+    def run(self, track: Track, state: int, start_s: float, end_s: float) -> Run:
         """Return the run of a state between two times."""
         inside = state != OUTSIDE
         zones = self.lookup.zones(state) if inside else frozenset()
@@ -244,8 +275,8 @@ class _States:
         return Run(
             start_s=start_s,
             end_s=end_s,
-            start_m=self.track.value(self.track.distance_m, start_s),
-            end_m=self.track.value(self.track.distance_m, end_s),
+            start_m=track.value(track.distance_m, start_s),
+            end_m=track.value(track.distance_m, end_s),
             inside=inside,
             rate_l_ha=0.0 if rate is None else rate,
             zones=zones,
@@ -254,22 +285,33 @@ class _States:
 
 def find_runs(track: Track, prescription: Prescription) -> list[Run]:
     """Return the runs along a track, without gaps between them."""
-    states = _States(track, prescription)
-    marked = track.marked()
-    marks_s = marked.time_s
-    found = states.along(marked)
-    turns = np.flatnonzero(found[1:] != found[:-1])
-    before = found[turns]
-    edges_s = bisect(
-        lambda t: states.at(track.places(t)) == before, marks_s[turns], marks_s[turns + 1]
+    return find_all_runs([track], prescription)[0]
+
+
+def find_all_runs(tracks: Sequence[Track], prescription: Prescription) -> list[list[Run]]:
+    """Return the runs along each track of a flight: what is asked of the map is asked at once."""
+    states = _States(tracks, prescription)
+    found = states.along()
+    turns = [np.flatnonzero(each[1:] != each[:-1]) for each in found]
+    number = np.repeat(np.arange(len(tracks)), [len(each) for each in turns])
+    marks_s = [track.time_s[track.marks] for track in tracks]
+    before, low_s, high_s = (
+        np.concatenate([each[at + ahead] for each, at in zip(values, turns, strict=True)])
+        for values, ahead in ((found, 0), (marks_s, 0), (marks_s, 1))
     )
-    ends_s = [float(marks_s[0]), *edges_s.tolist(), float(marks_s[-1])]
-    numbers = [*before.tolist(), int(found[-1])]
-    runs = [
-        states.run(number, start_s, end_s)
-        for number, (start_s, end_s) in zip(numbers, pairwise(ends_s), strict=True)
-    ]
-    return _merged(_without_slivers(runs), key=lambda run: (run.inside, run.zones))
+    edges_s = bisect(lambda t: states.under(number, t) == before, low_s, high_s)
+    runs = []
+    for i, track in enumerate(tracks):
+        its = number == i
+        ends_s = [float(marks_s[i][0]), *edges_s[its].tolist(), float(marks_s[i][-1])]
+        own = [
+            states.run(track, state, start_s, end_s)
+            for state, (start_s, end_s) in zip(
+                [*before[its].tolist(), int(found[i][-1])], pairwise(ends_s), strict=True
+            )
+        ]
+        runs.append(_merged(_without_slivers(own), key=lambda run: (run.inside, run.zones)))
+    return runs
 
 
 def stretches_of(runs: Sequence[Run]) -> list[Run]:

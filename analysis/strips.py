@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.changes import Run, find_runs, stretches_of
+from analysis.changes import Run, find_all_runs, stretches_of
 from analysis.flight_record import Orders
 from analysis.track import Bools, Floats, Ints, Track, tracks_of
 from analysis.transitions import ML_M_PER_L_HA_M
@@ -181,14 +181,16 @@ def strips_of(record: FlightRecord) -> list[Strip]:
     orders = [every.of_valve(valve) for valve in range(len(record.boom.valves))]
     tracks = tracks_of(record)
     spared = spared_of(record, tracks, orders)
+    runs = find_all_runs(tracks, record.prescription)
     return [
-        _strip(track, record, its, own)
-        for track, its, own in zip(tracks, orders, spared, strict=True)
+        _strip(track, record, each, its, own)
+        for track, each, its, own in zip(tracks, runs, orders, spared, strict=True)
     ]
 
 
-def _strip(track: Track, record: FlightRecord, orders: Orders, spared: Bools) -> Strip:
-    runs = find_runs(track, record.prescription)
+def _strip(
+    track: Track, record: FlightRecord, runs: list[Run], orders: Orders, spared: Bools
+) -> Strip:
     stretches = stretches_of(runs)
     whole, grazing = _inside(track, record.prescription)
     return Strip(

@@ -248,7 +248,8 @@ class Track:
 
     def sample(self, time_s: float) -> int:
         """Return the sample at or just before a time."""
-        return int(min(max((time_s - self.time_s[0]) / self.step_s, 0.0), len(self.time_s) - 1.0))
+        where = (time_s - self.time_s.item(0)) / self.step_s
+        return int(min(max(where, 0.0), len(self.time_s) - 1.0))
 
     def places(self, time_s: Floats) -> Places:
         """Return the places at any times."""

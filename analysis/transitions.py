@@ -124,9 +124,21 @@ def usual_doses_of(smooth: SmoothTrack, stretches: Sequence[Run]) -> list[float]
         start_s, end_s = (stretch.start_s + at * stretch.dwell_s for at in (LEVEL_FROM, LEVEL_TO))
         part = (smooth.track.sample(start_s), smooth.track.sample(end_s) + 1)
         if part not in medians:
-            medians[part] = float(np.median(smooth.dose_ml_m[slice(*part)]))
+            medians[part] = _median(smooth.dose_ml_m[slice(*part)])
         found.append(medians[part])
     return found
+
+
+def _median(values: Floats) -> float:
+    """Return the median as numpy does, in a tenth of its time for some hundred values."""
+    last = len(values) // 2
+    if not len(values) or np.isnan(values).any():
+        return math.nan
+    if len(values) % 2:
+        return float(np.partition(values, last)[last])
+    low, high = np.partition(values, (last - 1, last))[last - 1 : last + 1].tolist()
+    middle: float = 0.5 * (low + high)
+    return middle
 
 
 def prescribed_dose_ml_m(track: Track, rate_l_ha: float, time_s: float) -> float:

@@ -137,7 +137,7 @@ def bound_m(lag_m: Floats, sd_m: Floats, confidence: float = CONFIDENCE) -> floa
 
 def _normal(values: Floats) -> Floats:
     """Return the normal distribution's cumulative function."""
-    found: Floats = np.array([0.5 * math.erfc(-each / math.sqrt(2.0)) for each in values.tolist()])
+    found: Floats = 0.5 * np.array(list(map(math.erfc, (-values / math.sqrt(2.0)).tolist())))
     return found
 
 

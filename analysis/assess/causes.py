@@ -11,6 +11,7 @@ import re
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import shapely
@@ -301,6 +302,7 @@ LEFT_OUT_BELOW = 0.5
 # Less of a square inside the border is nothing; more squares on it than this go by their middle.
 SHARE_MIN = 0.02
 EDGE_CELLS_MAX = 50_000
+KEPT_CELLS_MAX = 200_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -334,7 +336,7 @@ def treated_ground(record: FlightRecord, strips: Sequence[Strip]) -> TreatedGrou
             total += each
     shape = (grid.rows, grid.columns)
     area = cell_m * cell_m
-    share, east_m, north_m = _shares(record.prescription, grid)
+    share, east_m, north_m = _known_shares(record.prescription, grid)
     # Of a cell that the border goes through, the part inside is the whole.
     ground_m2 = area * np.maximum(share, SHARE_MIN)
     times = covered[:-1].reshape(shape) / ground_m2
@@ -350,6 +352,22 @@ def treated_ground(record: FlightRecord, strips: Sequence[Strip]) -> TreatedGrou
         between_m2=float(share[missed & closed].sum()) * area,
         untreated_m2=float(share[open_ground].sum()) * area,
     )
+
+
+_SHARES: WeakKeyDictionary[Prescription, tuple[SquareGrid, tuple[Floats, Floats, Floats]]] = (
+    WeakKeyDictionary()
+)
+
+
+def _known_shares(prescription: Prescription, grid: SquareGrid) -> tuple[Floats, Floats, Floats]:
+    """Return `_shares`, which flights over the same map have in common; small ones are kept."""
+    known = _SHARES.get(prescription)
+    if known is not None and known[0] == grid:
+        return known[1]
+    found = _shares(prescription, grid)
+    if grid.rows * grid.columns <= KEPT_CELLS_MAX:
+        _SHARES[prescription] = (grid, found)
+    return found
 
 
 def _shares(prescription: Prescription, grid: SquareGrid) -> tuple[Floats, Floats, Floats]:

@@ -13,15 +13,15 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Self, TypeVar
+from typing import NamedTuple, Self, TypeVar
 
-from analysis.fleet.flight_row import Problem, Row, evaluated, flown_by, recorded
+from analysis.fleet.flight_row import Problem, Row, Signature, evaluated, flown_by, recorded
 from analysis.fleet.store import Store
 from companion.errors import ConfigError
 
@@ -37,6 +37,15 @@ Tell = Callable[[str, int, int], None]
 _Task = TypeVar("_Task")
 _Done = TypeVar("_Done")
 _Read = Row | Problem | str
+
+
+class _Waiting(NamedTuple):
+    """A journal to be evaluated: its machine, or its row and what the file was like then."""
+
+    path: Path
+    machine: str | None
+    row: Row | None = None
+    signature: Signature | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,7 +102,7 @@ def add(
 
 def _record(
     pool: _Pool, store: Store, paths: Sequence[Path], machine: str | None, tell: Tell
-) -> tuple[Added, list[tuple[Path, str | None]]]:
+) -> tuple[Added, list[_Waiting]]:
     """Write what the journals' tables hold; return which of them are to be evaluated."""
     began_s = time.monotonic()
     known = store.known()
@@ -104,21 +113,23 @@ def _record(
         if each.is_current and not (machine is not None and each.machine is None)
     )
     rows: dict[Path, Row] = {}
+    signatures: dict[Path, Signature] = {}
     problems: list[Problem] = []
-    waiting: list[tuple[Path, str | None]] = []
+    waiting: list[_Waiting] = []
     count, is_interrupted = 0, False
-    read = partial(recorded, machine=machine, known=done)
+    read = partial(_recorded, machine=machine, known=done)
     try:
-        for path, found in pool.each(read, paths, partial(tell, "reading journals")):
+        for path, (found, signature) in pool.each(read, paths, partial(tell, "reading journals")):
             count += 1
             if isinstance(found, Problem):
                 problems.append(found)
             elif isinstance(found, str):
                 if not by_sha[found].is_evaluated:
-                    waiting.append((path, by_sha[found].machine))
+                    waiting.append(_Waiting(path, by_sha[found].machine))
             else:
                 before = known.get(found["flight_id"])
                 rows[path] = found if before is None else flown_by(found, before.machine)
+                signatures[path] = signature
     except KeyboardInterrupt:
         # Of many thousand journals this is an hour's work: what was read is kept.
         is_interrupted = True
@@ -128,7 +139,11 @@ def _record(
     news = change.added | change.replaced
     # One journal of each flight, whichever copies were given.
     first = {row["flight_id"]: (path, row) for path, row in rows.items()}
-    waiting += [(path, row["machine"]) for key, (path, row) in first.items() if key in news]
+    waiting += [
+        _Waiting(path, row["machine"], row, signatures[path])
+        for key, (path, row) in first.items()
+        if key in news
+    ]
     there = known.keys() | first.keys()
     return Added(
         journals=count,
@@ -144,7 +159,7 @@ def _record(
 def _evaluate(
     pool: _Pool,
     store: Store,
-    waiting: Sequence[tuple[Path, str | None]],
+    waiting: Sequence[_Waiting],
     result: Added,
     tell: Tell,
 ) -> Added:
@@ -174,9 +189,15 @@ def _evaluate(
     )
 
 
-def _evaluated(task: tuple[Path, str | None]) -> _Read:
-    path, machine = task
-    return evaluated(path, machine=machine)
+def _recorded(path: Path, *, machine: str | None, known: Container[str]) -> tuple[_Read, Signature]:
+    signature = Signature.of(path)
+    return recorded(path, machine=machine, known=known), signature
+
+
+def _evaluated(task: _Waiting) -> _Read:
+    # A flight that went on since then is read anew.
+    row = task.row if task.signature == Signature.of(task.path) else None
+    return evaluated(task.path, machine=task.machine, row=row)
 
 
 # Processes.

@@ -12,7 +12,7 @@ import math
 import sqlite3
 from collections import Counter, defaultdict
 from collections.abc import Callable, Container, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
@@ -163,6 +163,24 @@ def sha256_of(path: Path) -> str:
     return found.hexdigest()
 
 
+class Signature(NamedTuple):
+    """What says that a file, and the log beside it, did not change since it was read."""
+
+    parts: tuple[tuple[int, int, int] | None, ...]
+
+    @classmethod
+    def of(cls, path: Path) -> Signature:
+        """Return the signature of a journal."""
+        parts: list[tuple[int, int, int] | None] = []
+        for each in (path, log_of(path)):
+            try:
+                about = each.stat()
+                parts.append((about.st_ino, about.st_size, about.st_mtime_ns))
+            except OSError:
+                parts.append(None)
+        return cls(tuple(parts))
+
+
 def recorded(
     path: Path, *, machine: str | None = None, known: Container[str] = ()
 ) -> Row | Problem | str:
@@ -170,19 +188,27 @@ def recorded(
 
     Of a journal whose hash is among the `known` ones only that.
     """
-    return _read(path, machine, known, lambda _journal, _setup, row: row)
+    return _read(path, machine, lambda _journal, _setup, row: row, known=known)
 
 
 def _read(
     path: Path,
     machine: str | None,
-    known: Container[str],
     finish: Callable[[OpenJournal, Setup, Row], Row],
+    *,
+    known: Container[str] = (),
+    row: Row | None = None,
 ) -> Row | Problem | str:
-    """Return what `finish` makes of the row of a journal, which is open meanwhile."""
+    """Return what `finish` makes of the row of a journal, which is open meanwhile.
+
+    A `row` is that of the same file, found sound a moment ago.
+    """
     digest = ""
     flight_id = None
     try:
+        if row is not None:
+            with opened(path, is_lenient=True) as journal:
+                return finish(journal, _setup_of(journal), row)
         if path.is_file() and (digest := sha256_of(path)) in known:
             return digest
         with opened(path, is_lenient=True) as journal:
@@ -197,7 +223,7 @@ def _read(
                     journal_sha256=digest,
                     flight_id=flight_id,
                 )
-            setup = journal.setup()
+            setup = _setup_of(journal)
             return finish(journal, setup, _row(journal, setup, digest, machine))
     except (JournalError, ShapelyError, *DAMAGE) as error:
         is_damaged = isinstance(error, UnreadableError) or not isinstance(error, JournalError)
@@ -211,6 +237,50 @@ def _read(
             journal_sha256=digest,
             flight_id=flight_id,
         )
+
+
+# Flights over the same map have the same set-up, and what is worked out of it: zones, edges, areas.
+_SETUPS_MAX = 4
+_GROUND = (
+    "SELECT name, rate_l_ha, geom FROM zones ORDER BY id",
+    "SELECT geom FROM field",
+    "SELECT * FROM cells",
+)
+_setups: dict[bytes, Setup] = {}
+
+
+def _setup_of(journal: OpenJournal) -> Setup:
+    """Return a journal's set-up: that of one before it, where text and ground are the same bytes.
+
+    What earlier flights treated is each journal's own.
+    """
+    try:
+        found = hashlib.sha256(journal.meta["setup"].encode())
+        for sql in _GROUND:
+            if sql is not _GROUND[-1] or _has_cells(journal.connection):
+                for row in journal.connection.execute(sql):
+                    for value in row:
+                        raw = value if isinstance(value, bytes) else repr(value).encode()
+                        found.update(b"%d:" % len(raw))
+                        found.update(raw)
+    except DAMAGE:
+        return journal.setup()
+    known = _setups.pop(found.digest(), None)
+    if known is None:
+        setup = journal.setup()
+        known = setup if setup.treated is None else replace(setup, treated=None)
+    else:
+        treated = read_treated(journal.connection)
+        setup = known if treated is None else replace(known, treated=treated)
+    _setups[found.digest()] = known
+    if len(_setups) > _SETUPS_MAX:
+        del _setups[next(iter(_setups))]
+    return setup
+
+
+def _has_cells(connection: sqlite3.Connection) -> bool:
+    sql = "SELECT 1 FROM sqlite_master WHERE name = 'cells'"
+    return connection.execute(sql).fetchone() is not None
 
 
 def _is_cut_to_nothing(path: Path) -> bool:
@@ -229,9 +299,14 @@ def flown_by(row: Row, machine: str | None) -> Row:
     return row if row["machine"] is not None else _versioned({**row, "machine": machine})
 
 
-def evaluated(path: Path, *, machine: str | None = None) -> Row | Problem | str:
-    """Return a journal's row with the figures of its report, or why there is none."""
-    return _read(path, machine, (), _evaluated)
+def evaluated(
+    path: Path, *, machine: str | None = None, row: Row | None = None
+) -> Row | Problem | str:
+    """Return a journal's row with the figures of its report, or why there is none.
+
+    `row` is what `recorded` made of it, where the file is still the same.
+    """
+    return _read(path, machine, _evaluated, row=row)
 
 
 def _evaluated(journal: OpenJournal, setup: Setup, row: Row) -> Row:

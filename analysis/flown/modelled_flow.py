@@ -46,7 +46,9 @@ class ValveFlow:
             return np.zeros(len(time_s))
         lengths_s = np.diff(knot_s)
         at_knots = np.concatenate(([0.0], np.cumsum(0.5 * (flow[1:] + flow[:-1]) * lengths_s)))
-        index = np.searchsorted(knot_s, time_s, "right") - 1
+        # Few knots are sought among many times, not each time among the knots.
+        at = np.searchsorted(time_s, knot_s)
+        index = np.cumsum(np.bincount(at, minlength=len(time_s) + 1)[:-1]) - 1
         begun = index >= 0
         index = np.maximum(index, 0)
         after_s = np.where(begun, time_s - knot_s[index], 0.0)

@@ -133,11 +133,22 @@ def _strip(
     for right_m in (valve.right_m - valve.width_m / 2, valve.right_m + valve.width_m / 2):
         x_m = east_m + right_m * np.cos(heading) + valve.forward_m * np.sin(heading)
         y_m = north_m - right_m * np.sin(heading) + valve.forward_m * np.cos(heading)
-        edge = shapely.simplify(shapely.linestrings(np.column_stack([x_m, y_m])), SIMPLIFY_M)
-        edges.append(shapely.get_coordinates(edge))
+        edges.append(_simplified(np.column_stack([x_m, y_m])))
     ring = np.vstack([edges[0], edges[1][::-1]])
     strip: BaseGeometry = shapely.make_valid(shapely.Polygon(ring))
     return strip if strip.area > 0.0 else None
+
+
+def _simplified(points_m: Floats) -> Floats:
+    """Return an edge without the points that lie near to a straight line.
+
+    One that goes ahead all the way cannot cross itself: nobody has to look whether it does.
+    """
+    along = np.diff(points_m, axis=0) @ (points_m[-1] - points_m[0])
+    edge = shapely.simplify(
+        shapely.linestrings(points_m), SIMPLIFY_M, preserve_topology=not (along > 0.0).all()
+    )
+    return shapely.get_coordinates(edge)
 
 
 def _positions(frame: LocalFrame, ring: shapely.LinearRing) -> list[list[float]]:
