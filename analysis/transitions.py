@@ -201,15 +201,19 @@ def _located(
     """
     track = smooth.track
     first, last = track.sample(early_s), track.sample(late_s) + 1
-    part = (smooth.dose_ml_m[first:last] - levels[0]) / (levels[1] - levels[0])
-    excess = np.cumsum((np.minimum(np.maximum(part, 0.0), 1.0) - 0.5) * smooth.metres[first:last])
-    middle = first + int(np.argmin(excess))
-    middle_s = float(track.time_s[middle])
-    low_s, high_s = _quarters_s(smooth, levels, middle, early_s, late_s)
+    doses = smooth.dose_ml_m[first:last]
+    part = (doses - levels[0]) / (levels[1] - levels[0])
+    # Arrays' own methods: of a few hundred values most of the time is to get to them.
+    done = np.minimum(np.maximum(part, 0.0), 1.0) - 0.5
+    middle = int((done * smooth.metres[first:last]).cumsum().argmin())
+    middle_s = track.time_s.item(first + middle)
+    span_s = track.time_s[first:last]
+    low_s, high_s = _quarters_s(span_s, part, middle, early_s, late_s)
     slow_s = _slow_s(track, low_s, high_s)
     beside = _levels_beside(smooth, middle_s, early_s, late_s) if slow_s > 0.0 else None
     if beside is not None and (beside[1] - beside[0]) * (levels[1] - levels[0]) > 0.0:
-        sharp_s = _quarters_s(smooth, beside, middle, early_s, late_s)
+        part = (doses - beside[0]) / (beside[1] - beside[0])
+        sharp_s = _quarters_s(span_s, part, middle, early_s, late_s)
         if not _slow_s(track, *sharp_s) > 0.0:
             (low_s, high_s), slow_s = sharp_s, 0.0
     return Transition(
@@ -223,21 +227,17 @@ def _located(
 
 
 def _quarters_s(
-    smooth: SmoothTrack,
-    levels: tuple[float, float],
-    middle: int,
-    early_s: float,
-    late_s: float,
+    time_s: Floats, part: Floats, middle: int, early_s: float, late_s: float
 ) -> tuple[float, float]:
-    """Return when the flow last had a quarter of the step, and when it first had three quarters."""
-    track = smooth.track
-    first, last = track.sample(early_s), track.sample(late_s) + 1
-    part = (smooth.dose_ml_m[first:last] - levels[0]) / (levels[1] - levels[0])
-    below = np.flatnonzero(part[: middle - first + 1] <= 0.25)
-    above = np.flatnonzero(part[middle - first :] >= 0.75)
-    low_s = track.time_s[first + below[-1]] if len(below) else early_s
-    high_s = track.time_s[middle + above[0]] if len(above) else late_s
-    return float(low_s), float(high_s)
+    """Return when the flow last had a quarter of the step, and when it first had three quarters.
+
+    `part` is how much of the step it has done at each time, `middle` the sample in between.
+    """
+    (below,) = (part[: middle + 1] <= 0.25).nonzero()
+    (above,) = (part[middle:] >= 0.75).nonzero()
+    low_s = time_s.item(below[-1]) if len(below) else early_s
+    high_s = time_s.item(middle + above[0]) if len(above) else late_s
+    return low_s, high_s
 
 
 def _slow_s(track: Track, low_s: float, high_s: float) -> float:

@@ -19,11 +19,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, Self, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, Self, TypeVar
 
 from analysis.fleet.flight_row import Problem, Row, Signature, evaluated, flown_by, recorded
-from analysis.fleet.store import Store
 from companion.errors import ConfigError
+
+if TYPE_CHECKING:
+    # The processes that it starts need none of its libraries.
+    from analysis.fleet.store import Store
 
 # To start processes takes as long as to read so many journals here.
 ALONE = 24

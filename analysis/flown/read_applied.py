@@ -79,11 +79,9 @@ def is_change(row: Row, valves: int) -> bool:
     )
 
 
-def are_changes(rows: list[Row], valves: int) -> bool:
-    """Whether all rows surely are changes: looked at column by column, which is quicker."""
-    if not rows:
-        return True
-    _, planned, actual, valve, duty = zip(*rows, strict=True)
+def are_changes(columns: Sequence[tuple[Any, ...]], valves: int) -> bool:
+    """Whether rows, here in columns, surely all are changes: quicker than each by itself."""
+    _, planned, actual, valve, duty = columns
     if {*map(type, valve), *map(type, duty)} != {int}:
         return False
     if not (min(valve) >= 0 and max(valve) < valves and min(duty) >= 0):
@@ -322,15 +320,16 @@ def read_changes(
     """
     what = "valve changes"
     if journal.version == "1":
-        rows: list[Row] = list(enumerate_rows(_planned(journal, names, unread)))
-        return _in_order(_table(rows)), []
+        made = enumerate_rows(_planned(journal, names, unread))
+        return _in_order(_table(list(zip(*made, strict=True)))), []
     found = rows_of(
         journal.connection, "valve_changes", _COLUMNS, key="id", unread=unread, what=what
     )
-    rows = found.rows
-    if not are_changes(rows, valves):
-        rows = sound_rows(rows, partial(is_change, valves=valves), unread, what)
-    table = _table(rows)
+    columns = list(zip(*found.rows, strict=True))
+    if columns and not are_changes(columns, valves):
+        rows = sound_rows(found.rows, partial(is_change, valves=valves), unread, what)
+        columns = list(zip(*rows, strict=True))
+    table = _table(columns)
     changes = _changes(table)
     holes = change_holes(
         table[:, 0].astype(np.int64),
@@ -346,10 +345,10 @@ def enumerate_rows(rows: Iterator[tuple[int | None, int | None, int, int]]) -> I
     return ((number, *row) for number, row in enumerate(rows, start=1))
 
 
-def _table(rows: list[Row]) -> Floats:
-    # Column by column: of rows numpy takes twice as long.
-    columns = [np.array(column, dtype=np.float64) for column in zip(*rows, strict=True)]
-    return np.stack(columns, axis=1) if columns else np.empty((0, 5))
+def _table(columns: Sequence[tuple[Any, ...]]) -> Floats:
+    # Of rows numpy takes twice as long.
+    found = [np.array(column, dtype=np.float64) for column in columns]
+    return np.stack(found, axis=1) if found else np.empty((0, 5))
 
 
 def _changes(table: Floats) -> ValveChanges:
