@@ -7,7 +7,7 @@ that flies a zig-zag backwards keeps its boom, and its left valve stays on its l
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import NamedTuple
@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.core.braking import CREEP_M_S, braking_begins_s
-from companion.core.frame import Floats, Offset
-from companion.core.motion import Turning, stretch
+from companion.core.frame import Box, Floats, Offset, PlainEdge
+from companion.core.motion import Turning, gained_s
 from companion.core.types import StopAhead, VehicleState
 
 
@@ -117,6 +117,20 @@ CURVE_CHORDS = 6
 KNOTS_APART_S = 1e-3
 
 
+class Pass(NamedTuple):
+    """A straight pass in plain numbers, as there are few: one chord, all points go the same way.
+
+    Of each point: east, north, its way east and north, how long that is, and on which side of
+    itself it lies (way east x north - way north x east).
+    """
+
+    time_s: tuple[float, float]
+    speed_m_s: tuple[float, float]
+    middle: tuple[tuple[float, float], tuple[float, float]]
+    right: tuple[float, float]
+    points: list[tuple[float, float, float, float, float, float]]
+
+
 class Paths(NamedTuple):
     """Predicted paths of points of the boom: (points, knots) arrays, knots at `time_s`."""
 
@@ -130,15 +144,29 @@ class Paths(NamedTuple):
     step_north_m: Floats
     length_m: Floats
 
-    def box(self, reach_m: float) -> tuple[float, float, float, float]:
-        """Return west, south, east, north of all within `reach_m` of the middle's path."""
-        east, north = zip(*self.middle, strict=True)
-        return (
-            min(east) - reach_m,
-            min(north) - reach_m,
-            max(east) + reach_m,
-            max(north) + reach_m,
-        )
+
+def box_of(middle: tuple[tuple[float, float], ...], reach_m: float) -> Box:
+    """Return west, south, east, north of all within `reach_m` of the middle's path."""
+    east, north = zip(*middle, strict=True)
+    return min(east) - reach_m, min(north) - reach_m, max(east) + reach_m, max(north) + reach_m
+
+
+def straight_pass(state: VehicleState, boom: Boom, *, back_s: float, ahead_s: float) -> Pass | None:
+    """Return the boom's path as `predict` has it; None where it is no single chord."""
+    motions = _motions(state, back_s, ahead_s)
+    if motions is None or len(motions) != 2:
+        return None
+    (begin_s, *_, e0, n0), (end_s, *_, e1, n1) = motions
+    right, offsets = _offsets(state.heading_deg, boom.right_m, boom.forward_m)
+    points = []
+    for east, north in offsets:
+        px, py = east + e0, north + n0
+        dx, dy = (east + e1) - px, (north + n1) - py
+        # The length as numpy has it, by the C library; `math.hypot` rounds otherwise.
+        points.append((px, py, dx, dy, abs(complex(dx, dy)), dx * py - dy * px))
+    times_s = (state.time_s + begin_s, state.time_s + end_s)
+    speeds_m_s = (math.hypot(*motions[0][1:3]), math.hypot(*motions[1][1:3]))
+    return Pass(times_s, speeds_m_s, ((e0, n0), (e1, n1)), right, points)
 
 
 def predict(
@@ -150,34 +178,26 @@ def predict(
     turn of the nose as well; on a straight path that ends in a stop, the braking before it.
     """
     heading_deg = state.heading_deg if state.heading_deg is not None else 0.0
-    speed = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
-    lateral = 0.0
-    if speed > 0.0:
-        lateral = (
-            state.velocity_east_m_s * state.acceleration_north_m_s2
-            - state.velocity_north_m_s * state.acceleration_east_m_s2
-        ) / speed
     yaw = turning_of(state)
-    is_straight = yaw.fastest_deg_s < STRAIGHT_YAW_RATE_DEG_S
-    turning = not (is_straight and abs(lateral) < STRAIGHT_LATERAL_M_S2)
-    chords = CURVE_CHORDS if turning else 1
-    knots = [-back_s + (back_s + ahead_s) * i / chords for i in range(chords + 1)]
-    if turning:
-        shape = (len(right_m), chords + 1)
+    motions = _motions(state, back_s, ahead_s)
+    turning = motions is None
+    if motions is None:
+        whole_s = back_s + ahead_s
+        knots = [-back_s + whole_s * i / CURVE_CHORDS for i in range(CURVE_CHORDS + 1)]
+        shape = (len(right_m), CURVE_CHORDS + 1)
         east, north, pace = np.empty(shape), np.empty(shape), np.empty(shape)
         middle = [
             _knot(state, dt_s, heading_deg, right_m, forward_m, (east, north, pace), i)
             for i, dt_s in enumerate(knots)
         ]
     else:
-        ae, an = _along(state)
-        motions = None
-        if state.stop_ahead is not None:
-            motions = _braked(state, state.stop_ahead, ae, an, back_s, ahead_s)
-        if motions is None:
-            motions = [(dt_s, *_carried(state, dt_s, ae, an)) for dt_s in knots]
         knots = [motion[0] for motion in motions]
-        east, north, pace, middle = _straight(motions, heading_deg, right_m, forward_m)
+        middle = [(motion[3], motion[4]) for motion in motions]
+        aside = np.array(_offsets(heading_deg, right_m, forward_m)[1])
+        east = aside[:, :1] + np.array([place[0] for place in middle])
+        north = aside[:, 1:] + np.array([place[1] for place in middle])
+        pace = np.empty(east.shape)
+        pace[:] = [math.hypot(motion[1], motion[2]) for motion in motions]
     rights = []
     for a, b in pairwise(knots):
         turned_deg = yaw.after((a + b) / 2)[0] if turning else 0.0
@@ -235,8 +255,11 @@ def _carried(
 
     The place outruns the velocity where an autopilot tells two motions.
     """
-    over = stretch(state.acceleration_fade_s, dt_s)
-    gained, carried = over.gained_s, over.carried_s2
+    gained = carried = 0.0  # into the past it goes at constant velocity
+    if dt_s > 0.0:
+        fade_s = state.acceleration_fade_s
+        gained = gained_s(dt_s, fade_s)
+        carried = fade_s * (dt_s - gained)
     goes_east, goes_north = place_velocity(state)
     return (
         state.velocity_east_m_s + ae * gained,
@@ -292,18 +315,34 @@ def _braked(
     return motions
 
 
-def _straight(
-    motions: list[_Motion], heading_deg: float, right_m: Floats, forward_m: Floats
-) -> tuple[Floats, Floats, Floats, list[tuple[float, float]]]:
-    """Return east, north and speed of all points at all knots, and the reference's places."""
-    angle = math.radians(heading_deg)
+def _motions(state: VehicleState, back_s: float, ahead_s: float) -> list[_Motion] | None:
+    """Return the motion at the knots of a straight path; None in a turn."""
+    ve, vn = state.velocity_east_m_s, state.velocity_north_m_s
+    speed, lateral = math.hypot(ve, vn), 0.0
+    if speed > 0.0:
+        lateral = (ve * state.acceleration_north_m_s2 - vn * state.acceleration_east_m_s2) / speed
+    is_straight = turning_of(state).fastest_deg_s < STRAIGHT_YAW_RATE_DEG_S
+    if not (is_straight and abs(lateral) < STRAIGHT_LATERAL_M_S2):
+        return None
+    ae, an = _along(state)
+    if state.stop_ahead is not None:
+        braked = _braked(state, state.stop_ahead, ae, an, back_s, ahead_s)
+        if braked is not None:
+            return braked
+    ends_s = (-back_s, -back_s + (back_s + ahead_s))
+    return [(dt_s, *_carried(state, dt_s, ae, an)) for dt_s in ends_s]
+
+
+def _offsets(
+    heading_deg: float | None, right_m: Floats, forward_m: Floats
+) -> tuple[tuple[float, float], list[tuple[float, float]]]:
+    """Return the boom's right, and how far east and north each point is of the reference."""
+    angle = math.radians(heading_deg or 0.0)
     sin, cos = math.sin(angle), math.cos(angle)
-    middle_east, middle_north = [m[3] for m in motions], [m[4] for m in motions]
-    east = (right_m * cos + forward_m * sin)[:, None] + np.array(middle_east)
-    north = (forward_m * cos - right_m * sin)[:, None] + np.array(middle_north)
-    pace = np.empty(east.shape)
-    pace[:] = [math.hypot(m[1], m[2]) for m in motions]
-    return east, north, pace, list(zip(middle_east, middle_north, strict=True))
+    return (cos, -sin), [
+        (right * cos + forward * sin, forward * cos - right * sin)
+        for right, forward in zip(right_m.tolist(), forward_m.tolist(), strict=True)
+    ]
 
 
 def _knot(
@@ -337,15 +376,14 @@ def _knot(
 
 
 def time_on_chord(
-    paths: Paths, chord: int, point: int, s: float, reach: float
+    times_s: Sequence[float], speeds_m_s: Sequence[float], s: float, reach: float
 ) -> tuple[float, float]:
-    """Return when the path is `s` metres along the chord, and its speed there.
+    """Return when the path is `s` metres along a chord of that length, and its speed there.
 
     Speed changes evenly along a chord: s = v0 t + (v1 - v0) t^2 / 2T, scaled to the chord's end
-    (as in `crossings._cuts`, where it is solved for all cuts at once).
+    (as in `crossings._cut`).
     """
-    t0, t1 = paths.time_s[chord], paths.time_s[chord + 1]
-    v0, v1 = paths.speed_m_s.item(point, chord), paths.speed_m_s.item(point, chord + 1)
+    (t0, t1), (v0, v1) = times_s, speeds_m_s
     if not v0 + v1 > 1e-9:
         return t0, 0.0
     share = s / reach
@@ -380,49 +418,77 @@ def add_contacts(
     if not len(ends):
         return
     chords = len(paths.time_s) - 1
-    half_m = boom.half_width_m + buffer_m
     for chord in range(chords):
-        if chords == 1:
-            contacts = _contacts_of_one_chord(paths, ends, half_m.tolist())
-        else:
-            contacts = _contacts(paths, chord, ends, half_m)
-        if contacts is None:
-            for intervals in closed:
-                intervals.append((paths.time_s[chord], paths.time_s[chord + 1]))
-            continue
-        length = paths.length_m[:, chord].tolist()
-        for valve, _, limits in contacts if merge is None else merge(contacts):
-            first, last = limits[0] - buffer_m, limits[1] + buffer_m
-            reach = length[valve]
-            if last < 0.0 or first > reach:
-                continue
-            begin = time_on_chord(paths, chord, valve, max(first, 0.0), reach)[0]
-            end = time_on_chord(paths, chord, valve, min(last, reach), reach)[0]
-            beyond = last > reach and chord == chords - 1
-            closed[valve].append((begin, math.inf if beyond else end))
+        found = _contacts(paths, chord, ends, widened(boom, buffer_m))
+        times_s = paths.time_s[chord], paths.time_s[chord + 1]
+        speeds = paths.speed_m_s[:, chord : chord + 2].tolist()
+        ways = list(zip(paths.length_m[:, chord].tolist(), speeds, strict=True))
+        _close(found, times_s, ways, buffer_m, closed, merge, is_last=chord == chords - 1)
 
 
-def _contacts_of_one_chord(paths: Paths, ends: Floats, half_m: list[float]) -> list[Contact] | None:
-    """Return the contacts on a straight pass, where all strips go the same way.
+def add_contacts_of_pass(
+    way: Pass,
+    edges: list[PlainEdge],
+    boom: Boom,
+    buffer_m: float,
+    closed: list[Intervals],
+) -> None:
+    """Add to `closed` when an edge of the border lies within a strip, on a straight pass."""
+    if edges:
+        found = _contacts_of_pass(way, edges, widened(boom, buffer_m).tolist())
+        ways = [(point[4], way.speed_m_s) for point in way.points]
+        _close(found, way.time_s, ways, buffer_m, closed, None, is_last=True)
 
-    In plain numbers, as few edges are near. None where the boom lies along its own motion.
+
+def widened(boom: Boom, buffer_m: float) -> Floats:
+    """Return half of each strip's width, with the buffer beside it."""
+    half_m: Floats = boom.half_width_m + buffer_m
+    return half_m
+
+
+def _close(
+    contacts: list[Contact] | None,
+    times_s: tuple[float, float],
+    ways: Sequence[tuple[float, Sequence[float]]],
+    buffer_m: float,
+    closed: list[Intervals],
+    merge: Merge | None,
+    *,
+    is_last: bool,
+) -> None:
+    """Add when the contacts of a chord are; `ways` are each valve's length of it, and its speeds.
+
+    The chord's whole time where the boom lies along its own motion, and nothing can be judged.
     """
-    rx, ry = paths.right[0]
-    edges = ends.tolist()
+    if contacts is None:
+        for intervals in closed:
+            intervals.append(times_s)
+        return
+    for valve, _, limits in contacts if merge is None else merge(contacts):
+        first, last = limits[0] - buffer_m, limits[1] + buffer_m
+        reach, speeds_m_s = ways[valve]
+        if last < 0.0 or first > reach:
+            continue
+        begin = time_on_chord(times_s, speeds_m_s, max(first, 0.0), reach)[0]
+        end = time_on_chord(times_s, speeds_m_s, min(last, reach), reach)[0]
+        closed[valve].append((begin, math.inf if last > reach and is_last else end))
+
+
+def _contacts_of_pass(
+    way: Pass, edges: list[PlainEdge], half_m: list[float]
+) -> list[Contact] | None:
+    """Return the contacts on a straight pass; None where the boom lies along its own motion."""
+    rx, ry = way.right
     contacts: list[Contact] = []
-    for valve, (px, py, dx, dy, length, half) in enumerate(
-        zip(
-            paths.east_m[:, 0].tolist(), paths.north_m[:, 0].tolist(),
-            paths.step_east_m[:, 0].tolist(), paths.step_north_m[:, 0].tolist(),
-            paths.length_m[:, 0].tolist(), half_m, strict=True,
-        )
-    ):  # fmt: skip
+    for valve, ((px, py, dx, dy, length, _), half) in enumerate(
+        zip(way.points, half_m, strict=True)
+    ):
         safe = max(length, 1e-12)
         ux, uy = dx / safe, dy / safe
         turn = (dx * ry - dy * rx) / safe  # sine of the angle from path to boom
         if not abs(turn) >= ACROSS_MIN:
             return None
-        for edge, (x0, y0, x1, y1) in enumerate(edges):
+        for edge, (x0, y0, x1, y1, _) in enumerate(edges):
             across_0 = (ux * (y0 - py) - uy * (x0 - px)) / turn
             across_1 = (ux * (y1 - py) - uy * (x1 - px)) / turn
             if (across_0 > half and across_1 > half) or (across_0 < -half and across_1 < -half):

@@ -11,10 +11,11 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import attrgetter
 from typing import TYPE_CHECKING, NamedTuple
 
 from companion.core.boom import Intervals, Paths, speed_shares
-from companion.core.crossings import NO_ROUTES, KnownRoutes, Route, carried_on, find_routes
+from companion.core.crossings import NO_ROUTES, KnownRoutes, Route, carried_on, find_routes, rate_at
 from companion.core.frame import Offset
 from companion.core.nozzle import (
     NozzleSet,
@@ -40,7 +41,14 @@ from companion.core.options.pump import constant_drive, liquid_of, modulated, on
 from companion.core.options.treated_area import TreatedArea
 from companion.core.options.valve_tracking import TrackMemory
 from companion.core.safety import UNASKED, Permission, closed_plan, guard, permit, shown
-from companion.core.schedule import Dosing, ValveSchedule, rate_at, schedule, sticky_border_s
+from companion.core.schedule import (
+    Dosing,
+    ValveSchedule,
+    in_zone,
+    is_in_zone,
+    schedule,
+    sticky_border_s,
+)
 from companion.core.setup import Setup
 from companion.core.types import (
     Decision,
@@ -333,7 +341,15 @@ def _orders(
 ) -> Orders:
     """Return the changes of each valve along its route; `liquid` is what the meter's flow is of."""
     speed_m_s = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
-    index, set_of_rate = _nozzle_sets(setup, state, routes, before, speed_m_s)
+    # The middle of the boom decides on the set.
+    index, set_of_rate = sets_ahead(
+        setup.nozzle_sets,
+        routes[len(routes) // 2],
+        in_use=before.set_index,
+        before=before.set_of_rate,
+        flow_of=_flow_of(setup, state, speed_m_s),
+        now_s=state.time_s,
+    )
     trim = _trim(setup, state, before, liquid, now_s)
     skew = skew_of(state, speed_m_s)
 
@@ -353,18 +369,21 @@ def _orders(
             setup.pumping, routes, ran_s=ran_s, was_early=before.is_early, now_s=now_s
         )
     valves: list[ValveSchedule] = []
-    before_key = None
+    alike: dict[tuple[float | None, float, float, Dosing], ValveSchedule] = {}
     for valve, route in enumerate(own_routes):
         own = shares[valve]
         of_valve = dosing(valve) if setup.pumping is None else on_off
-        # Neighbours in the middle of one zone do the same.
-        key = (route[0].rate_l_ha, own, in_force[valve], of_valve) if len(route) == 1 else None
-        if key is not None and key == before_key:
-            valves.append(valves[-1].of(valve))
-            continue
-        before_key = key
-        valves.append(
-            schedule(
+        if is_in_zone(route, longest_s=setup.longest_s, now_s=now_s, until_s=until_s):
+            # Neighbours in the middle of one zone do the same.
+            key = (route[0].rate_l_ha, own, in_force[valve], of_valve)
+            made = (
+                alike[key].of(valve)
+                if key in alike
+                else in_zone(key[0], valve, of_valve, in_force[valve], soon_m_s * own, now_s)
+            )
+            alike[key] = made
+        else:
+            made = schedule(
                 route,
                 valve=valve,
                 timing=setup.timings[valve],
@@ -376,7 +395,7 @@ def _orders(
                 overdrive=overdrive,
                 sticky_border_s=sticky_s,
             )
-        )
+        valves.append(made)
     gain = 1.0 if trim is None else trim.sets[index].trim
     return Orders(valves, Ordering(index, set_of_rate, trim, is_early), speed_m_s, skew, gain)
 
@@ -406,24 +425,6 @@ def _trim(
     )
 
 
-def _nozzle_sets(
-    setup: Setup,
-    state: VehicleState,
-    routes: tuple[Route, ...],
-    before: Ordering,
-    speed_m_s: float,
-) -> tuple[int, SetOfRate]:
-    """Return the set in use and those of the rates ahead; the middle of the boom decides."""
-    return sets_ahead(
-        setup.nozzle_sets,
-        routes[len(routes) // 2],
-        in_use=before.set_index,
-        before=before.set_of_rate,
-        flow_of=_flow_of(setup, state, speed_m_s),
-        now_s=state.time_s,
-    )
-
-
 def _flow_of(setup: Setup, state: VehicleState, speed_m_s: float) -> Callable[[float], float]:
     """Return the function from a rate of the map to the whole boom's flow [L/min] at a speed."""
 
@@ -444,8 +445,7 @@ def _in_force(setup: Setup, plan: SprayPlan | None, now_s: float) -> tuple[float
 
 def _in_order(valves: list[ValveSchedule]) -> tuple[TimedChange, ...]:
     changes = [change for valve in valves for change in valve.changes]
-    changes.sort(key=lambda change: change.at_s)
-    return tuple(changes)
+    return tuple(sorted(changes, key=attrgetter("at_s")))
 
 
 def _drives(
@@ -508,10 +508,6 @@ def _decision(
     known = {rate: flow_of(rate or 0.0) for rate in set(rates)}
     flows = [known[rates[valve]] for valve in nozzles.valves]
     too_much = {flow for flow in known.values() if not nozzles.curve.delivers(flow)}
-    late = unresolved = 0
-    for of_valve in orders.valves:
-        late += of_valve.late
-        unresolved += of_valve.unresolved_count
     sets = setup.doses.nozzle_sets if watched.track is None else _nozzles(setup, watched)
     flow_l_min = _flow(setup, plan, sets[index])
     if setup.trimming is not None and trim is not None:
@@ -526,8 +522,8 @@ def _decision(
         rate_l_ha=tuple(rates),
         target_flow_l_min=sum(flows) / len(flows),
         flow_l_min=flow_l_min * orders.gain,
-        late_count=late,
-        unresolved_count=unresolved,
+        late_count=sum([valve.late for valve in orders.valves]),
+        unresolved_count=sum([valve.unresolved_count for valve in orders.valves]),
         flow_trim=None if trim is None else trim.sets[index].trim,
         flow_trim_state=None if trim is None else trim.state,
         findings=_all_findings(setup, watched),

@@ -13,8 +13,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable
-from itertools import pairwise
+from collections.abc import Callable, Sequence, Set
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -23,15 +22,19 @@ from companion.core.boom import (
     STRAIGHT_YAW_RATE_DEG_S,
     Boom,
     Intervals,
+    Pass,
     Paths,
     add_contacts,
+    add_contacts_of_pass,
+    box_of,
     joined,
     place_velocity,
     predict,
+    straight_pass,
     swept,
     turning_of,
 )
-from companion.core.frame import Floats, Ints, Offset
+from companion.core.frame import Floats, Ints, Offset, PlainEdge
 from companion.core.prescription import FIELD, SLIVER_M, Prescription
 from companion.core.types import VehicleState
 
@@ -70,6 +73,15 @@ class Crossing(NamedTuple):
 Route = tuple[Crossing, ...]
 
 
+def rate_at(route: Sequence[Crossing], now_s: float) -> float | None:
+    """Return what a route prescribes at a time."""
+    rate = route[0].rate_l_ha
+    for crossing in route:
+        if crossing.at_s <= now_s:
+            rate = crossing.rate_l_ha
+    return rate
+
+
 class _Cut(NamedTuple):
     """A path cuts an edge: which polygon (`owner`), and whether it is entered."""
 
@@ -80,6 +92,18 @@ class _Cut(NamedTuple):
     enters: bool
 
 
+def _cut(
+    times_s: tuple[float, float], v0: float, v1: float, gone: float, s: float, reach_m: float,
+    owner: int, enters: bool,
+) -> _Cut:  # fmt: skip
+    """Return the cut `s` metres along a chord, before which the path has `gone` so far."""
+    share, v0_2 = s / reach_m, v0 * v0
+    speed = math.sqrt(v0_2 + (v1 * v1 - v0_2) * share)
+    t0, t1 = times_s
+    at_s = t0 + share * (v0 + v1) / max(v0 + speed, 1e-9) * (t1 - t0)
+    return _Cut(at_s, gone + s, speed, owner, enters)
+
+
 # Where a path meets an edge: chord, rounded way along it, whether its polygon is entered, point,
 # way, the chord's length, and the polygon. In order of the path; leaving before entering, where
 # both are at one place.
@@ -88,59 +112,58 @@ _Met = tuple[int, int, bool, int, float, float, int]
 
 def _cuts(paths: Paths, ends: Floats, owner: Ints) -> list[list[_Cut]]:
     """Return, for each point, where its path cuts the edges, in order of time."""
-    count, chords = paths.length_m.shape
+    count = len(paths.length_m)
     found: list[list[_Cut]] = [[] for _ in range(count)]
     if not len(ends):
         return found
-    met = _met_on_one_chord(paths, ends, owner) if chords == 1 else _met(paths, ends, owner)
+    met = _met(paths, ends, owner)
     if not met:
         return found
     met.sort()
-    pace = paths.speed_m_s.tolist()
-    along = np.cumsum(paths.length_m, axis=1).tolist() if chords > 1 else []
+    pace, along = paths.speed_m_s.tolist(), np.cumsum(paths.length_m, axis=1).tolist()
     for chord, _, enters, point, s, reach_m, who in met:
-        share = s / reach_m
-        v0, v1 = pace[point][chord : chord + 2]
-        v0_2 = v0 * v0
-        speed = math.sqrt(v0_2 + (v1 * v1 - v0_2) * share)
-        t0, t1 = paths.time_s[chord], paths.time_s[chord + 1]
-        at_s = t0 + share * (v0 + v1) / max(v0 + speed, 1e-9) * (t1 - t0)
+        times_s = paths.time_s[chord], paths.time_s[chord + 1]
         gone = along[point][chord - 1] if chord else 0.0
-        found[point].append(_Cut(at_s, gone + s, speed, who, enters))
+        v0, v1 = pace[point][chord : chord + 2]
+        found[point].append(_cut(times_s, v0, v1, gone, s, reach_m, who, enters))
     return found
 
 
-def _met_on_one_chord(paths: Paths, ends: Floats, owner: Ints) -> list[_Met]:
-    """Return what is met on a straight pass, where all points go the same way.
+def _cuts_of_pass(way: Pass, edges: list[PlainEdge]) -> list[list[_Cut]]:
+    """Return, for each point of a straight pass, where its path cuts the edges, in order of time.
 
-    There only points between the ends of an edge, seen along the way, can meet it. In plain
-    numbers: few edges are near.
+    Only points between the ends of an edge, seen along the way, can meet it.
     """
-    east, north = paths.east_m[:, 0].tolist(), paths.north_m[:, 0].tolist()
-    steps_e, steps_n = paths.step_east_m[:, 0].tolist(), paths.step_north_m[:, 0].tolist()
-    lengths = paths.length_m[:, 0].tolist()
-    way_e, way_n = steps_e[0], steps_n[0]
-    in_order = sorted(
-        [(way_e * y - way_n * x, i) for i, (x, y) in enumerate(zip(east, north, strict=True))]
-    )
+    points, (v0, v1) = way.points, way.speed_m_s
+    _, _, way_e, way_n, _, _ = points[0]
+    in_order = sorted([(way_e * p[1] - way_n * p[0], i) for i, p in enumerate(points)])
     sides = [side for side, _ in in_order]
-    met: list[_Met] = []
-    for (x0, y0, x1, y1), who in zip(ends.tolist(), owner.tolist(), strict=True):
-        low, high = sorted((way_e * y0 - way_n * x0, way_e * y1 - way_n * x1))
+    least, most = sides[0] - SAME_SIDE_M2, sides[-1] + SAME_SIDE_M2
+    met: list[list[tuple[int, bool, float, float, int]]] = [[] for _ in points]
+    for x0, y0, x1, y1, who in edges:
+        low, high = way_e * y0 - way_n * x0, way_e * y1 - way_n * x1
+        if low > high:
+            low, high = high, low
+        if low > most or high < least:
+            continue
         first = bisect_left(sides, low - SAME_SIDE_M2)
         for _, point in in_order[first : bisect_left(sides, high + SAME_SIDE_M2, first)]:
-            px, py, dx, dy = east[point], north[point], steps_e[point], steps_n[point]
-            a, b, own = dx * y0 - dy * x0, dx * y1 - dy * x1, dx * py - dy * px
+            px, py, dx, dy, reach_m, own = points[point]
+            a, b = dx * y0 - dy * x0, dx * y1 - dy * x1
             if (a >= own) == (b >= own):
                 continue
             share = (a - own) / (a - b)
             s = (x0 + share * (x1 - x0) - px) * dx
             s += (y0 + share * (y1 - y0) - py) * dy
-            reach_m = lengths[point]
             s /= max(reach_m, 1e-12)
             if START_NUDGE_M < s <= reach_m:
-                met.append((0, round(s * 1e6), a > b, point, s, reach_m, who))
-    return met
+                met[point].append((round(s * 1e6), a > b, s, reach_m, who))
+    for each in met:
+        each.sort()
+    return [
+        [_cut(way.time_s, v0, v1, 0.0, s, reach, who, enters) for _, enters, s, reach, who in each]
+        for each in met
+    ]
 
 
 def _met(paths: Paths, ends: Floats, owner: Ints) -> list[_Met]:
@@ -194,19 +217,22 @@ def find_routes(
     reach_m = boom.reach_m + border_buffer_m + SLIVER_M
     if drift_m is not None:
         reach_m += math.hypot(*drift_m)
+    way = None
+    if across == "centre" and close_more is None and drift_m is None:
+        way = straight_pass(state, boom, back_s=back_s, ahead_s=ahead_s)
+    if way is not None:
+        return _routes_of_pass(prescription, way, boom, reach_m, border, border_buffer_m)
     paths = predict(state, boom.right_m, boom.forward_m, back_s=back_s, ahead_s=ahead_s)
-    ends, owner = prescription.edges_near(*paths.box(reach_m))
+    ends, owner = prescription.edges_near(*box_of(paths.middle, reach_m))
     bases = prescription.owners_at(*_starts(paths))
     cuts = _cuts(paths, ends, owner)
+    speeds = paths.speed_m_s[:, [0, -1]].tolist()
+    span_s = paths.time_s[0], paths.time_s[-1]
     if across == "centre":
-        rates = _rates(prescription, paths, bases, cuts)
+        rates = _rates(prescription, span_s[0], speeds, bases, cuts)
     else:
         rates = _rates_across(prescription, state, boom, (ends, owner), across, back_s, ahead_s)
-    start_s = paths.time_s[0]
-    closed = [
-        _centre_outside(FIELD in base, found, start_s)
-        for base, found in zip(bases, cuts, strict=True)
-    ]
+    closed = _centres_outside(bases, cuts, span_s[0])
     if border == "inside":
         edges = ends[owner == FIELD]
         if drift_m is not None:
@@ -215,28 +241,56 @@ def find_routes(
         add_contacts(paths, edges, boom, border_buffer_m, closed, merge)
     if close_more is not None:
         close_more(paths, closed)
-    return tuple(
-        [_combine(rates[valve], closed[valve], paths, valve, border) for valve in range(len(rates))]
-    )
+    each = zip(rates, closed, speeds, strict=True)
+    return tuple([_combine(*one, span_s, border) for one in each])
 
 
-# A timeline: (at_s, rate, speed_m_s), the first entry at the start of the path.
-_Steps = list[tuple[float, float | None, float]]
+def _routes_of_pass(
+    prescription: Prescription,
+    way: Pass,
+    boom: Boom,
+    reach_m: float,
+    border: Border,
+    border_buffer_m: float,
+) -> tuple[Route, ...]:
+    """Return the routes along a straight pass: the same as of any path, in plain numbers."""
+    box = box_of(way.middle, reach_m)
+    near = prescription.near(box)
+    edges = near.edges_in(box)
+    bases = prescription.owners_near(near, *_starts_of_pass(way))
+    cuts = _cuts_of_pass(way, edges)
+    speeds = [way.speed_m_s] * len(way.points)
+    rates = _rates(prescription, way.time_s[0], speeds, bases, cuts)
+    closed = _centres_outside(bases, cuts, way.time_s[0])
+    if border == "inside":
+        edges = [edge for edge in edges if edge[4] == FIELD]
+        add_contacts_of_pass(way, edges, boom, border_buffer_m, closed)
+    each = zip(rates, closed, speeds, strict=True)
+    return tuple([_combine(*one, way.time_s, border) for one in each])
+
+
+# A timeline: as a route without any closed ground, the first entry at the start of the path.
+_Steps = list[Crossing]
 
 
 def _rates(
-    prescription: Prescription, paths: Paths, bases: list[set[int]], found: list[list[_Cut]]
+    prescription: Prescription,
+    start_s: float,
+    speeds: Sequence[Sequence[float]],
+    bases: Sequence[Set[int]],
+    found: list[list[_Cut]],
 ) -> list[_Steps]:
     """Return the rate along each point's path."""
-    start_s = paths.time_s[0]
-    paces = paths.speed_m_s[:, 0].tolist()
     timelines = []
-    for base, cuts, pace in zip(bases, found, paces, strict=True):
-        inside = base - {FIELD}
+    for base, cuts, (pace, _) in zip(bases, found, speeds, strict=True):
+        inside = set(base)
+        inside.discard(FIELD)
         rate = prescription.rate_of(frozenset(inside))
-        steps: _Steps = [(start_s, rate, pace)]
+        steps = [Crossing(start_s, rate, False, pace)]
         timelines.append(steps)
-        zone_cuts = [cut for cut in cuts if cut.owner != FIELD] if cuts else cuts
+        if not cuts:
+            continue
+        zone_cuts = [cut for cut in cuts if cut.owner != FIELD]
         for i, cut in enumerate(zone_cuts):
             if cut.enters:
                 inside.add(cut.owner)
@@ -246,7 +300,7 @@ def _rates(
                 continue  # the next zone begins here: a gap this narrow is none
             new = prescription.rate_of(frozenset(inside))
             if new != rate:
-                steps.append((cut.at_s, new, cut.speed_m_s))
+                steps.append(Crossing(cut.at_s, new, False, cut.speed_m_s))
                 rate = new
     return timelines
 
@@ -257,15 +311,21 @@ def _starts(paths: Paths) -> tuple[Floats, Floats]:
     Ahead, so that none lies on an edge it just cut; to the right, as the side test has an edge
     that is flown along on the left: on the edge itself a point is in neither of its zones.
     """
-    east, north = paths.east_m[:, 0], paths.north_m[:, 0]
-    if len(paths.time_s) == 2:  # a straight pass: all go the same way
-        east_m, north_m = paths.step_east_m.item(0, 0), paths.step_north_m.item(0, 0)
-        nudge = START_NUDGE_M / max(paths.length_m.item(0, 0), START_NUDGE_M)
-        return east + nudge * (east_m + 0.1 * north_m), north + nudge * (north_m - 0.1 * east_m)
     dx, dy = paths.step_east_m[:, 0], paths.step_north_m[:, 0]
     ahead = START_NUDGE_M / np.maximum(paths.length_m[:, 0], START_NUDGE_M)
     aside = 0.1 * ahead
-    return east + dx * ahead + dy * aside, north + dy * ahead - dx * aside
+    return (
+        paths.east_m[:, 0] + dx * ahead + dy * aside,
+        paths.north_m[:, 0] + dy * ahead - dx * aside,
+    )
+
+
+def _starts_of_pass(way: Pass) -> tuple[list[float], list[float]]:
+    """Return the starts of a straight pass, likewise: all go the same way."""
+    _, _, dx, dy, length, _ = way.points[0]
+    nudge = START_NUDGE_M / max(length, START_NUDGE_M)
+    ahead_e, ahead_n = nudge * (dx + 0.1 * dy), nudge * (dy - 0.1 * dx)
+    return [p[0] + ahead_e for p in way.points], [p[1] + ahead_n for p in way.points]
 
 
 def _rates_across(
@@ -283,19 +343,19 @@ def _rates_across(
     right = (boom.right_m[:, None] + boom.half_width_m[:, None] * shares).ravel()
     forward = np.repeat(boom.forward_m, count)
     paths = predict(state, right, forward, back_s=back_s, ahead_s=ahead_s)
-    every = _rates(
-        prescription, paths, prescription.owners_at(*_starts(paths)), _cuts(paths, *edges)
-    )
+    speeds = paths.speed_m_s[:, [0, -1]].tolist()
+    bases = prescription.owners_at(*_starts(paths))
+    every = _rates(prescription, paths.time_s[0], speeds, bases, _cuts(paths, *edges))
     timelines = []
     for valve in range(len(boom.valves)):
         parts = every[valve * count : (valve + 1) * count]
-        events = sorted({(at_s, speed) for part in parts for at_s, _, speed in part})
+        events = sorted({(step.at_s, step.speed_m_s) for part in parts for step in part})
         steps: _Steps = []
         for i, (at_s, speed) in enumerate(events):
             next_s = events[i + 1][0] if steps and i + 1 < len(events) else math.inf
             if (next_s - at_s) * speed < SLIVER_M:
                 continue  # the points of a strip reach one boundary at one time
-            now = [_value_at(part, at_s) for part in parts]
+            now = [rate_at(part, at_s) for part in parts]
             given = [
                 (rate, weight)
                 for rate, weight in zip(now, weights, strict=True)
@@ -307,8 +367,8 @@ def _rates_across(
                 value = max(rate for rate, _ in given)
             else:
                 value = sum(rate * weight for rate, weight in given)
-            if not steps or steps[-1][1] != value:
-                steps.append((at_s, value, speed))
+            if not steps or steps[-1].rate_l_ha != value:
+                steps.append(Crossing(at_s, value, False, speed))
         timelines.append(steps)
     return timelines
 
@@ -325,37 +385,33 @@ def _across(width_m: float) -> tuple[Floats, list[float]]:
     return np.linspace(-1.0, 1.0, spans + 1), weights.tolist()
 
 
-def _value_at(steps: _Steps, at_s: float) -> float | None:
-    value = steps[0][1]
-    for start_s, rate, _ in steps:
-        if start_s > at_s:
-            break
-        value = rate
-    return value
-
-
-def _centre_outside(inside: bool, cuts: list[_Cut], start_s: float) -> Intervals:
-    """Return when the strip's centre is outside the field."""
-    intervals: Intervals = []
-    since_s = start_s
-    for cut in cuts:
-        if cut.owner != FIELD:
-            continue
-        if inside and not cut.enters:
-            inside, since_s = False, cut.at_s
-        elif not inside and cut.enters:
-            inside = True
-            intervals.append((since_s, cut.at_s))
-    if not inside:
-        intervals.append((since_s, math.inf))
-    return intervals
+def _centres_outside(
+    bases: Sequence[Set[int]], found: list[list[_Cut]], start_s: float
+) -> list[Intervals]:
+    """Return when the centre of each strip is outside the field."""
+    closed = []
+    for base, cuts in zip(bases, found, strict=True):
+        intervals: Intervals = []
+        closed.append(intervals)
+        inside, since_s = FIELD in base, start_s
+        for cut in cuts:
+            if cut.owner != FIELD:
+                continue
+            if inside and not cut.enters:
+                inside, since_s = False, cut.at_s
+            elif not inside and cut.enters:
+                inside = True
+                intervals.append((since_s, cut.at_s))
+        if not inside:
+            intervals.append((since_s, math.inf))
+    return closed
 
 
 def _combine(
     rates: _Steps,
     closed: Intervals,
-    paths: Paths,
-    valve: int,
+    speeds: Sequence[float],
+    span_s: tuple[float, float],
     border: Border,
 ) -> Route:
     """Return one timeline of rates, closed where the border rule says so.
@@ -364,127 +420,22 @@ def _combine(
     times of the two differ by rounding, and the one that comes first says nothing.
     """
     if not closed:
-        return tuple([Crossing(at_s, rate, False, speed) for at_s, rate, speed in rates])
+        return tuple(rates)
     strict = border == "inside"
     ends = {t for interval in closed for t in interval if t < math.inf}
-    start_s, end_s = paths.time_s[0], paths.time_s[-1]
-    pace = {at_s: speed for at_s, _, speed in rates}
+    (start_s, end_s), (begun, ended) = span_s, speeds
+    pace = {step.at_s: step.speed_m_s for step in rates}
     route: list[Crossing] = []
     for at_s in sorted(ends | set(pace) | {start_s}):
         shut = any(begin <= at_s < end for begin, end in closed)
-        rate = None if shut else _value_at(rates, at_s)
+        rate = None if shut else rate_at(rates, at_s)
         outside = strict and shut
         if not route or rate != route[-1].rate_l_ha or outside != route[-1].outside:
             speed = pace.get(at_s)
             if speed is None:
-                share = (at_s - start_s) / (end_s - start_s)
-                begun, ended = paths.speed_m_s.item(valve, 0), paths.speed_m_s.item(valve, -1)
-                speed = begun + share * (ended - begun)
+                speed = begun + (at_s - start_s) / (end_s - start_s) * (ended - begun)
             route.append(Crossing(at_s, rate, outside, speed))
     return tuple(route)
-
-
-# The routes of all valves as one: what the boom as a whole is prescribed along its way.
-#
-# A pump makes the flow of all sections together, and an atomiser's speed follows that flow. The
-# rate of the whole is the mean of the strips' rates by their widths; closed strips count as 0.
-
-
-def boom_route(
-    routes: tuple[Route, ...], boom: Boom, *, merge_s: float = 0.0, shuts_outside: bool = False
-) -> Route:
-    """Return the mean rate over the boom; None where every strip is closed.
-
-    Sections cross a slanting boundary one after the other. Steps between two flows that are nearer
-    to each other than `merge_s` become one, at the moment at which it carries the same volume.
-    Where every strip is closed, the boom is outside as soon as one of them is; with
-    `shuts_outside` it is closed there.
-
-    >>> from companion.core.boom import Valve
-    >>> boom = Boom(width_m=4.0, valves=tuple(
-    ...     Valve(name=name, right_m=0.0, forward_m=0.0, width_m=w) for name, w in (("1", 1.0),
-    ...                                                                             ("2", 3.0))))
-    >>> left = (Crossing(0.0, None, True, 5.0), Crossing(1.0, 20.0, False, 5.0))
-    >>> right = (Crossing(0.0, None, True, 5.0), Crossing(1.5, 20.0, False, 5.0))
-    >>> [(step.at_s, step.rate_l_ha) for step in boom_route((left, right), boom)]
-    [(0.0, None), (1.0, 5.0), (1.5, 20.0)]
-    """
-    widths = (2.0 * boom.half_width_m).tolist()
-    whole_m = sum(widths)
-    crossings: dict[float, list[tuple[int, Crossing]]] = {}
-    for valve, route in enumerate(routes):
-        for crossing in route[1:]:
-            crossings.setdefault(crossing.at_s, []).append((valve, crossing))
-    rates = [route[0].rate_l_ha or 0.0 for route in routes]
-    is_outside = [route[0].outside for route in routes]
-
-    def whole(at_s: float, speed_m_s: float) -> Crossing:
-        rate = sum(rate * width for rate, width in zip(rates, widths, strict=True)) / whole_m
-        outside = any(is_outside)
-        if rate > 0.0 and not (outside and shuts_outside):
-            return Crossing(at_s, rate, False, speed_m_s)
-        return Crossing(at_s, None, outside, speed_m_s)
-
-    first = routes[len(routes) // 2][0]
-    made = [whole(first.at_s, first.speed_m_s)]
-    for at_s in sorted(crossings):
-        here = crossings[at_s]
-        for valve, crossing in here:
-            rates[valve] = crossing.rate_l_ha or 0.0
-            is_outside[valve] = crossing.outside
-        now = whole(at_s, sum(crossing.speed_m_s for _, crossing in here) / len(here))
-        if not now.is_as(made[-1]):
-            made.append(now)
-    return _merged(tuple(made), merge_s) if merge_s > 0.0 else tuple(made)
-
-
-def _merged(route: Route, merge_s: float) -> Route:
-    made = [route[0]]
-    i = 1
-    while i < len(route):
-        last = i
-        while (
-            last + 1 < len(route)
-            and route[last + 1].at_s - route[i].at_s < merge_s
-            and all(step.rate_l_ha is not None for step in route[i - 1 : last + 2])
-        ):
-            last += 1
-        made.append(_as_one(route[i - 1 : last + 1]))
-        i = last + 1
-    return tuple(made)
-
-
-def _as_one(steps: Route) -> Crossing:
-    """Return the steps behind the first as one, where a sharp one would carry their volume."""
-    end = steps[-1]
-    if len(steps) == 2:
-        return end
-    rises = [(step.at_s, (step.rate_l_ha or 0.0) - (ahead.rate_l_ha or 0.0))
-             for ahead, step in pairwise(steps)]  # fmt: skip
-    rise = sum(each for _, each in rises)
-    if rise == 0.0:
-        return end
-    at_s = sum(at_s * each for at_s, each in rises) / rise
-    return end._replace(at_s=min(max(at_s, steps[1].at_s), end.at_s))
-
-
-def bridged(route: Route, gap_s: float) -> Route:
-    """Return the route with closed stretches shorter than `gap_s` at the rate before them.
-
-    What cannot stop and start again in the time goes on; whether anything comes out is the
-    valves' affair.
-    """
-    made: list[Crossing] = [route[0]]
-    for i in range(1, len(route)):
-        step = route[i]
-        if step.rate_l_ha is None and made[-1].rate_l_ha is not None:
-            again = (each.at_s for each in route[i:] if each.rate_l_ha is not None)
-            follows_s = next(again, float("inf"))
-            if follows_s - step.at_s < gap_s:
-                continue
-        if not step.is_as(made[-1]):
-            made.append(step)
-    return tuple(made)
 
 
 # Routes found in one step serve the next ones too, as long as the prediction holds.

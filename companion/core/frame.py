@@ -20,6 +20,10 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 # Metres east and north.
 Place = tuple[float, float]
+# West, south, east and north [m].
+Box = tuple[float, float, float, float]
+# An edge of a map: its ends (east, north, east, north), and whose it is.
+PlainEdge = tuple[float, float, float, float, int]
 # East and north [m], from a nozzle to where its droplets land.
 Offset = tuple[float, float]
 

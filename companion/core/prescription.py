@@ -8,10 +8,11 @@ number of zones. A map in rows and columns has its cells instead of zones (`cell
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from itertools import compress
+from typing import Literal, NamedTuple
 
 import numpy as np
 import shapely
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from shapely import Geometry, MultiPolygon, Polygon, STRtree
 
 from companion.core.cells import NO_RATE, CellGrid
-from companion.core.frame import Floats, Ints
+from companion.core.frame import Box, Floats, Ints, PlainEdge
 
 Overlap = Literal["error", "max", "min", "mean", "last"]
 
@@ -63,6 +64,51 @@ class Edges:
         return self.tree.query(shapely.box(west_m, south_m, east_m, north_m))
 
 
+# What is near is looked up so much farther than was asked for: paths go on from step to step.
+NEAR_M = 4.0
+
+
+class Near(NamedTuple):
+    """What of a map lies near a box, in plain numbers, as it is little and asked for often.
+
+    Of each edge its own box first. `parts` is a column of polygons, each with its box and owner.
+    """
+
+    within: Box
+    edges: list[tuple[float, float, float, float, PlainEdge]]
+    parts: NDArray[np.object_]
+    boxes: list[Box]
+    owners: list[int]
+
+    def covers(self, box: Box) -> bool:
+        """Return whether it has all that is near another box."""
+        west, south, east, north = self.within
+        return west <= box[0] and south <= box[1] and box[2] <= east and box[3] <= north
+
+    def edges_in(self, box: Box) -> list[PlainEdge]:
+        """Return the edges whose boxes meet a box that it covers."""
+        west, south, east, north = box
+        return [
+            edge
+            for w, s, e, n, edge in self.edges
+            if w <= east and s <= north and e >= west and n >= south
+        ]
+
+    def owners_at(self, east_m: list[float], north_m: list[float]) -> list[frozenset[int]]:
+        """Return as `Prescription.owners_at` does, for points that it covers."""
+        west, south, east, north = min(east_m), min(north_m), max(east_m), max(north_m)
+        hit = [
+            i
+            for i, (w, s, e, n) in enumerate(self.boxes)
+            if w <= east and s <= north and e >= west and n >= south
+        ]
+        within = shapely.contains_xy(self.parts[hit], np.array(east_m), np.array(north_m)).tolist()
+        owners = [self.owners[i] for i in hit]
+        inside = list(zip(*within, strict=True)) or [()] * len(east_m)
+        of_each = {one: frozenset(compress(owners, one)) for one in set(inside)}
+        return [of_each[one] for one in inside]
+
+
 class Prescription:
     """Zones with rates and the field that they may be sprayed on.
 
@@ -103,7 +149,7 @@ class Prescription:
         zone_parts, owner = _parts([zone.polygon for zone in zones])
         ground: Geometry | None = boundary
         if ground is None:
-            ground = closed(dissolved(zone_parts)) if cells is None else cells.outline
+            ground = _outline(zone_parts) if cells is None else cells.outline
         self.field = _field(ground, exclusions)
         # Without a boundary or an exclusion, inside is where a cell has a rate: no need to ask.
         self._is_all_cells = cells is not None and boundary is None and not exclusions
@@ -117,6 +163,7 @@ class Prescription:
             self.field.bounds if not self.field.is_empty else (0.0, 0.0, 0.0, 0.0)
         )
         self._rate_of: dict[frozenset[int], float | None] = {}
+        self._near: Near | None = None
 
     @cached_property
     def zones(self) -> tuple[Zone, ...]:
@@ -163,6 +210,37 @@ class Prescription:
             return ends, owner
         cell_ends, cell_owner = self.cells.edges_in(west_m, south_m, east_m, north_m)
         return np.concatenate([ends, cell_ends]), np.concatenate([owner, cell_owner])
+
+    def near(self, box: Box) -> Near:
+        """Return what lies near a box; the last answer serves as long as it covers what is asked.
+
+        It is of this map and its box alone, and neither changes.
+        """
+        found = self._near
+        if found is None or not found.covers(box):
+            west, south, east, north = box
+            within = (west - NEAR_M, south - NEAR_M, east + NEAR_M, north + NEAR_M)
+            ends, owner = self.edges_near(*within)
+            low, high = np.minimum(ends[:, :2], ends[:, 2:]), np.maximum(ends[:, :2], ends[:, 2:])
+            plain = zip(*ends.T.tolist(), owner.tolist(), strict=True)
+            boxes = np.hstack([low, high]).tolist()
+            parts = self._tree.query(shapely.box(*within))
+            found = self._near = Near(
+                within,
+                [(w, s, e, n, edge) for (w, s, e, n), edge in zip(boxes, plain, strict=True)],
+                self._parts[parts][:, None],
+                list(map(tuple, shapely.bounds(self._parts[parts]).tolist())),
+                self._owner[parts].tolist(),
+            )
+        return found
+
+    def owners_near(
+        self, near: Near, east_m: list[float], north_m: list[float]
+    ) -> Sequence[Set[int]]:
+        """Return as `owners_at` does, for points near what was looked up."""
+        if self.cells is None:
+            return near.owners_at(east_m, north_m)
+        return self.owners_at(np.array(east_m), np.array(north_m))
 
     def rate_of(self, zones: frozenset[int]) -> float | None:
         """Return the rate where exactly these zones lie, by the overlap policy."""
@@ -262,6 +340,14 @@ def _edges(parts: NDArray[np.object_], owner: Ints) -> Edges:
     return Edges(ends=ends, owner=owners.astype(np.int64), tree=STRtree(lines))
 
 
+def _outline(parts: NDArray[np.object_]) -> Geometry:
+    """Return the ground of all zones together."""
+    # A flight map has its border: in flight this is never loaded.
+    from companion.core.outline import dissolved
+
+    return closed(dissolved(parts))
+
+
 def closed(ground: Geometry) -> Geometry:
     """Return the ground of all zones with the slivers between them closed."""
     grown = shapely.buffer(ground, SLIVER_M / 2, join_style="mitre")
@@ -279,162 +365,3 @@ def _field(
         return field
     polygons = [part for part in shapely.get_parts(field) if isinstance(part, Polygon)]
     return MultiPolygon(polygons)
-
-
-# Polygons that share their borders, joined into one ground.
-#
-# A map of 22 000 polygons has a quarter of a million edges, and most of them stand twice: once with
-# each of two neighbours, in opposite directions. What stands once is the outline. An overlay finds
-# that out anew for every pair, and takes ten times as long.
-
-Objects = NDArray[np.object_]
-
-# A corner this near to a neighbour's edge stands on it: maps are written with so many decimals.
-CORNER_OFF_M = 0.001
-# Corners that stand on edges, for every edge; a border has one or two.
-_CORNERS_MAX = 20
-_BITE = 5_000
-# A polygon with more corners is not made smaller: that could take longer than all the rest.
-_SIMPLE_MAX = 1_000
-
-
-def dissolved(parts: Objects) -> Geometry:
-    """Return the ground of all single, valid polygons (in metres) together.
-
-    Corners may move by a millimetre onto the edge of a neighbour. Polygons that overlap by more
-    are joined to the others by an overlay.
-    """
-    found = without_overlay(parts)
-    if found is not None:
-        return found[0]
-    inner = shrunk(parts)
-    one, two = STRtree(inner).query(inner, "intersects")
-    alone = np.ones(len(parts), dtype=np.bool_)
-    alone[one[one != two]] = False
-    found = without_overlay(parts[alone])
-    if found is None:
-        return shapely.union_all(parts)
-    return shapely.union(found[0], shapely.union_all(parts[~alone]))
-
-
-def shrunk(parts: Objects) -> Objects:
-    """Return the polygons without the half millimetre along their borders that neighbours share."""
-    inner = parts.copy()
-    simple = shapely.get_num_coordinates(parts) <= _SIMPLE_MAX
-    inner[simple] = shapely.buffer(parts[simple], -CORNER_OFF_M / 2, join_style="mitre")
-    return inner
-
-
-def without_overlay(parts: Objects) -> tuple[Geometry, float] | None:
-    """Return the ground of polygons that do not overlap, and how much could; None if they may.
-
-    How many polygons lie over a point follows from their edges alone, each with its polygon on the
-    left, and two opposite edges cancel out. Where what is left over is the outline of some ground,
-    one polygon lies over each of its points and none over others: no pair overlaps. That it is
-    the outline is checked. Only the area [m2] between an edge and the corners that were put on it
-    is hidden from that, and no two polygons share more than all of it.
-    """
-    if len(parts) < 2:
-        return (parts[0], 0.0) if len(parts) else None
-    xy, ring = shapely.get_coordinates(
-        shapely.get_rings(shapely.orient_polygons(parts)), return_index=True
-    )
-    # As complex numbers: numpy finds equal ones much faster than equal rows.
-    places, corner = np.unique(xy @ np.array([1.0, 1.0j]), return_inverse=True)
-    points = np.column_stack([places.real, places.imag])
-    edge = np.flatnonzero(ring[1:] == ring[:-1])
-    edges = _cancelled(np.column_stack([corner[edge], corner[edge + 1]]), len(places))
-    cut = None if edges is None else _cut_at_corners(edges, points)
-    if cut is None:
-        return None
-    left = _cancelled(cut[0], len(places))
-    ground = None if left is None else _ground(left, places)
-    return None if ground is None else (ground, cut[1])
-
-
-def lines_of(ends: Floats) -> Objects:
-    """Return a line for every two ends (n, 2, 2)."""
-    return np.array(shapely.linestrings(ends))
-
-
-def _cancelled(edges: Ints, count: int) -> Ints | None:
-    """Return the edges (from, to) without those that are opposite; None where two are the same."""
-    low, high = edges.min(axis=1), edges.max(axis=1)
-    way, which = np.unique(low * count + high, return_inverse=True)
-    sign = np.sign(edges[:, 1] - edges[:, 0])
-    left = np.bincount(which, weights=sign, minlength=len(way)).astype(np.int64)
-    if not (np.abs(left) <= 1).all():
-        return None
-    low, high = np.divmod(way[left != 0], count)
-    forward = left[left != 0, None] > 0
-    return np.where(forward, np.column_stack([low, high]), np.column_stack([high, low]))
-
-
-def _cut_at_corners(edges: Ints, points: Floats) -> tuple[Ints, float] | None:
-    """Return the edges, cut where corners of others stand on them, and the area in between."""
-    corners = np.unique(edges)
-    found = _near(edges, corners, points)
-    if found is None:
-        return None
-    edge, corner = found
-    start, end = edges[edge].T
-    along, to_corner = points[end] - points[start], points[corner] - points[start]
-    share = (along * to_corner).sum(axis=1) / (along**2).sum(axis=1)
-    on = (corner != start) & (corner != end) & (share > 0.0) & (share < 1.0)
-    # Between an edge and its corners: no more than the triangles over it, each with one of them.
-    cross = along[:, 0] * to_corner[:, 1] - along[:, 1] * to_corner[:, 0]
-    hidden_m2 = float(np.abs(cross[on]).sum()) / 2
-    order = np.lexsort((share[on], edge[on]))
-    corner, edge = corner[on][order], edge[on][order]
-    # Every edge as its start, its corners and its end, then from each of these to the next.
-    stops = np.bincount(edge, minlength=len(edges))
-    last = np.cumsum(stops + 2) - 1
-    chain = np.empty(2 * len(edges) + len(corner), dtype=np.int64)
-    chain[last - stops - 1], chain[last] = edges.T
-    chain[np.arange(len(corner)) + 2 * edge + 1] = corner
-    goes_on = np.ones(len(chain), dtype=np.bool_)
-    goes_on[last] = False
-    begin = np.flatnonzero(goes_on)
-    return np.column_stack([chain[begin], chain[begin + 1]]), hidden_m2
-
-
-def _near(edges: Ints, corners: Ints, points: Floats) -> tuple[Ints, Ints] | None:
-    """Return the edges and the corners that are near each other; None where they crowd."""
-    tree = STRtree(lines_of(points[edges]))
-    at = np.array(shapely.points(points[corners]))
-    found: list[tuple[Ints, Ints]] = []
-    left = _CORNERS_MAX * len(edges)
-    for first in range(0, len(corners), _BITE):
-        near, edge = tree.query(at[first : first + _BITE], "dwithin", distance=CORNER_OFF_M)
-        found.append((edge, corners[first + near]))
-        left -= len(edge)
-        if left < 0:
-            return None
-    if not found:
-        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
-    return np.concatenate([one for one, _ in found]), np.concatenate([two for _, two in found])
-
-
-def _ground(edges: Ints, places: NDArray[np.complex128]) -> Geometry | None:
-    """Return the ground whose outline these edges are, all of them and no others, or None."""
-    if not len(edges):
-        return None
-    points = np.column_stack([places.real, places.imag])
-    lines = lines_of(points[edges])
-    faces = shapely.orient_polygons(shapely.get_parts(shapely.polygonize(lines)))
-    if not len(faces):
-        return None
-    xy, ring = shapely.get_coordinates(shapely.get_rings(faces), return_index=True)
-    face_of_ring = np.repeat(np.arange(len(faces)), shapely.get_num_interior_rings(faces) + 1)
-    begin = np.flatnonzero(ring[1:] == ring[:-1])
-    corner = np.searchsorted(places, xy @ np.array([1.0, 1.0j]))
-    ways = corner[begin] * len(places) + corner[begin + 1]
-    wanted = np.sort(edges[:, 0] * len(places) + edges[:, 1])
-    # Of a face that is no ground, but lies in a hole of it, all edges run the other way.
-    right = wanted[np.searchsorted(wanted, ways).clip(max=len(wanted) - 1)] == ways
-    owner = face_of_ring[ring[begin]]
-    inside = np.bincount(owner, weights=~right, minlength=len(faces)) == 0
-    if not np.array_equal(np.sort(ways[inside[owner]]), wanted):
-        return None
-    ground = shapely.multipolygons(faces[inside])
-    return ground if shapely.is_valid(ground) else None

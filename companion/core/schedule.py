@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 from companion.core.boom import Valve
-from companion.core.crossings import Crossing, Route
+from companion.core.crossings import Crossing, Route, rate_at
 from companion.core.types import Method, PwmLimits, TimedChange
 
 Reference = Literal["volume", "settled"]
@@ -230,7 +230,7 @@ class ValveSchedule(NamedTuple):
             TimedChange(at_s=each.at_s, valve=valve, duty=each.duty, restart=each.restart)
             for each in self.changes
         ]
-        return self._replace(changes=tuple(changes))
+        return ValveSchedule(tuple(changes), *self[1:])
 
 
 def resolve(route: Route, dwell_min_s: float) -> tuple[Route, int]:
@@ -411,7 +411,7 @@ def schedule(
     it turns out to be due up to `sticky_border_s` later.
     """
     if len(route) == 1:
-        return _in_zone(route[0].rate_l_ha, valve, dosing, in_force, speed_soon_m_s, now_s)
+        return in_zone(route[0].rate_l_ha, valve, dosing, in_force, speed_soon_m_s, now_s)
     due = 0
     resolved, unresolved = resolve(route, timing.dwell_min_s)
     made = orders(resolved, timing, dosing, overdrive)
@@ -456,7 +456,18 @@ def _trims(
     return changes
 
 
-def _in_zone(
+def is_in_zone(route: Route, *, longest_s: float, now_s: float, until_s: float) -> bool:
+    """Whether nothing of a route is ordered or held back by `until_s`: its zone goes on.
+
+    `longest_s` is the longest lead of any order.
+    """
+    if len(route) == 1:
+        return True
+    # Of more than one crossing, a stay may be too short, which is counted.
+    return len(route) == 2 and route[1].at_s - longest_s > max(until_s, now_s + STICKY_S)
+
+
+def in_zone(
     rate_l_ha: float | None,
     valve: int,
     dosing: Dosing,
@@ -501,15 +512,6 @@ def _already_ordered(
     if min(now.duty, following.duty, in_force) > 0.0:
         near = max(near, NEAR_STEP_SHARE * abs(following.duty - now.duty))
     return to_next <= near and to_next < abs(now.duty - in_force)
-
-
-def rate_at(route: Route, now_s: float) -> float | None:
-    """Return what a route prescribes at a time."""
-    rate = route[0].rate_l_ha
-    for crossing in route:
-        if crossing.at_s <= now_s:
-            rate = crossing.rate_l_ha
-    return rate
 
 
 # A slow flow is driven past its target for a moment, so that it stands there sooner.

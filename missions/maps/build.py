@@ -14,7 +14,8 @@ from shapely.errors import ShapelyError
 
 from companion.core.cells import NO_RATE
 from companion.core.frame import LocalFrame
-from companion.core.prescription import Overlap, Prescription, Zone, closed, dissolved
+from companion.core.outline import dissolved
+from companion.core.prescription import Overlap, Prescription, Zone, closed
 from companion.flight_map import moved
 from missions.maps.cells import bounds_deg, grid_of, turns_clockwise
 from missions.maps.local import (

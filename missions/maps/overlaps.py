@@ -12,7 +12,8 @@ import shapely
 from numpy.typing import NDArray
 from shapely import Geometry, STRtree
 
-from companion.core.prescription import SLIVER_M, lines_of, without_overlay
+from companion.core.outline import lines_of, without_overlay
+from companion.core.prescription import SLIVER_M
 from companion.errors import MapError
 from missions.maps.local import Area
 from missions.maps.model import map_error

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from shapely import MultiPolygon, STRtree
 
 from companion.core.frame import LocalFrame
-from companion.core.prescription import without_overlay
+from companion.core.outline import without_overlay
 from missions.maps.build import frame_for
 from missions.maps.cells import cell_areas_m2, shares_inside
 from missions.maps.convert.cell_zones import plain_zones

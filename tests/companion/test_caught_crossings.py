@@ -14,7 +14,7 @@ import shapely
 
 from companion.core import boom as geometry
 from companion.core import crossings
-from companion.core.boom import Boom, Paths, Valve, predict
+from companion.core.boom import Boom, Pass, Paths, Valve, predict, straight_pass
 from companion.core.controller import Memory, step
 from companion.core.crossings import Route, find_routes
 from companion.core.motion import CRUISE
@@ -78,8 +78,8 @@ def test_the_tip_of_a_zone_that_is_only_touched_changes_nothing() -> None:
     assert [rate for _, rate in found] == [10.0]
 
 
-def _ways_ahead(heading_deg: float, course_deg: float) -> tuple[Paths, Boom]:
-    """Return a straight pass whose middle flies through the corner at (12, 6)."""
+def _ways_ahead(heading_deg: float, course_deg: float) -> tuple[Pass, Paths, Boom]:
+    """Return a straight pass whose middle flies through the corner at (12, 6), in both forms."""
     valves = tuple(
         Valve(name=str(k), right_m=k - 2.0, forward_m=0.2 * k, width_m=1.0) for k in range(5)
     )
@@ -89,7 +89,9 @@ def _ways_ahead(heading_deg: float, course_deg: float) -> tuple[Paths, Boom]:
         10.0, 12.0 - 3.0 * math.sin(angle), 6.0 - 3.0 * math.cos(angle), heading_deg=heading_deg,
         velocity_east_m_s=5.0 * math.sin(angle), velocity_north_m_s=5.0 * math.cos(angle),
     )  # fmt: skip
-    return predict(state, boom.right_m, boom.forward_m, back_s=0.3, ahead_s=1.2), boom
+    way = straight_pass(state, boom, back_s=0.3, ahead_s=1.2)
+    assert way is not None
+    return way, predict(state, boom.right_m, boom.forward_m, back_s=0.3, ahead_s=1.2), boom
 
 
 @pytest.mark.parametrize("course_deg", [0.0, 45.0, 90.0, 137.0, 180.0, 211.0, 270.0, 359.0])
@@ -101,16 +103,42 @@ def test_a_straight_pass_meets_what_chords_of_any_direction_meet(
         Zone(name=f"{x}-{y}", polygon=shapely.box(4 * x, 2 * y, 4 * x + 4, 2 * y + 2), rate_l_ha=9)
         for x in range(6) for y in range(6)
     ]  # fmt: skip
-    edges = Prescription(zones).edges
-    paths, boom = _ways_ahead(course_deg + off_deg, course_deg)
-    met = sorted(crossings._met_on_one_chord(paths, edges.ends, edges.owner))
-    assert met == sorted(crossings._met(paths, edges.ends, edges.owner))
-    assert len(met) > 5
-    half_m = boom.half_width_m + 0.1
-    touched = geometry._contacts_of_one_chord(paths, edges.ends, half_m.tolist())
-    by_arrays = geometry._contacts(paths, 0, edges.ends, half_m)
+    field = Prescription(zones)
+    way, paths, boom = _ways_ahead(course_deg + off_deg, course_deg)
+    ends, owner = field.edges.ends, field.edges.owner
+    plain = [(*each, who) for each, who in zip(ends.tolist(), owner.tolist(), strict=True)]
+    cuts = crossings._cuts_of_pass(way, plain)
+    assert cuts == crossings._cuts(paths, ends, owner)
+    assert sum(map(len, cuts)) > 5
+    half_m = geometry.widened(boom, 0.1)
+    touched = geometry._contacts_of_pass(way, plain, half_m.tolist())
+    by_arrays = geometry._contacts(paths, 0, ends, half_m)
     assert (touched is None) == (by_arrays is None) == (off_deg == 89.0)
     assert sorted(touched or ()) == sorted(by_arrays or ())
+    assert way.right == paths.right[0]
+    starts = np.array(crossings._starts_of_pass(way))
+    assert starts == pytest.approx(np.array(crossings._starts(paths)), abs=1e-9)
+
+
+def test_what_is_near_a_path_is_what_the_map_has_there_wherever_one_was_before() -> None:
+    zones = [
+        Zone(name=f"{x}-{y}", polygon=shapely.box(4 * x, 2 * y, 4 * x + 4, 2 * y + 2), rate_l_ha=9)
+        for x in range(9) for y in range(9)
+    ]  # fmt: skip
+    field = Prescription(zones, exclusions=[shapely.Point(15, 9).buffer(2.0)])
+    draw = np.random.default_rng(7)
+    for _ in range(200):
+        # A step on, mostly, as a flight goes; then somewhere else.
+        west, south = (float(each) for each in draw.uniform((-6.0, -6.0), (40.0, 22.0)))
+        for farther_m in range(4):
+            box = (west + farther_m, south, west + farther_m + 3.0, south + 5.0)
+            near = field.near(box)
+            ends, owner = field.edges_near(*box)
+            plain = [(*each, who) for each, who in zip(ends.tolist(), owner.tolist(), strict=True)]
+            assert sorted(near.edges_in(box)) == sorted(plain)
+            east_m, north_m = draw.uniform(box[:2], box[2:], size=(6, 2)).T
+            owners = field.owners_near(near, east_m.tolist(), north_m.tolist())
+            assert owners == field.owners_at(east_m, north_m)
 
 
 def test_a_boom_along_its_own_motion_is_closed_where_a_border_is_near() -> None:

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 
 from companion.core.boom import Boom, Valve
 from companion.core.controller import Memory, step
-from companion.core.crossings import Crossing, Route
+from companion.core.crossings import Crossing, Route, rate_at
 from companion.core.options.coverage import Coverage
 from companion.core.options.overlap import STRETCH_MIN_M, OverlapGuard, cut, wake_m
 from companion.core.options.treated_area import SNAPSHOTS_MAX
 from companion.core.prescription import Prescription
-from companion.core.schedule import orders, rate_at
+from companion.core.schedule import orders
 from companion.core.setup import Setup
 from companion.core.types import TimedChange
 from tests.builders import LAG, along, flying, plots, setup

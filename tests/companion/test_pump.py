@@ -10,12 +10,13 @@ from itertools import pairwise
 import pytest
 
 from companion.core.controller import Memory, step
-from companion.core.crossings import Crossing, boom_route, bridged
+from companion.core.crossings import Crossing
 from companion.core.nozzle import FlowCurve
 from companion.core.options.atomisers import Atomiser, DropletLaw, Flow, spinning
 from companion.core.options.flow_meter import Detection
 from companion.core.options.flow_trim import FlowTrim
 from companion.core.options.pump import Pump, liquid_plan
+from companion.core.options.whole_boom import boom_route, bridged
 from companion.core.types import DriveChange, DrivePlan, SprayPlan, TimedChange
 from companion.journal.codec import FIELD_NAMES, decode, encode
 from tests.builders import boom, flying, setup

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely import Polygon, box
 
-from companion.core.prescription import Objects, dissolved, without_overlay
+from companion.core.outline import Objects, dissolved, without_overlay
 from missions.maps.overlaps import overlaps
 
 

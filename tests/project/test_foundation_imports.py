@@ -33,7 +33,7 @@ ALLOWED = {
 }
 CORE_ALLOWED = {
     "numpy": None,
-    "shapely": {"prescription.py", "cells.py"},
+    "shapely": {"prescription.py", "outline.py", "cells.py"},
     "pyproj": {"frame.py"},
 }
 PURE = {

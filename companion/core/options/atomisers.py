@@ -15,8 +15,9 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from companion.core.boom import Boom
-from companion.core.crossings import Route, boom_route
+from companion.core.crossings import Route
 from companion.core.nozzle import FlowCurve, flow_for_rate, overridden
+from companion.core.options.whole_boom import boom_route
 from companion.core.types import DriveChange, DrivePlan
 
 # As of a valve's trims: smaller moves are noise of the speed.

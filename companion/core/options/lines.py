@@ -261,12 +261,13 @@ def _within(
         if not first < last or not low_m < high_m:
             continue
         # A chord's own ends are its times, to the last bit: the next one goes on there.
-        since_s, until_s = paths.time_s[chord], paths.time_s[chord + 1]
+        since_s, until_s = times_s = paths.time_s[chord : chord + 2]
+        speeds_m_s = paths.speed_m_s[valve, chord : chord + 2].tolist()
         reach = paths.length_m.item(valve, chord)
         if first > 0.0:
-            since_s = time_on_chord(paths, chord, valve, first * reach, reach)[0]
+            since_s = time_on_chord(times_s, speeds_m_s, first * reach, reach)[0]
         if last < 1.0:
-            until_s = time_on_chord(paths, chord, valve, last * reach, reach)[0]
+            until_s = time_on_chord(times_s, speeds_m_s, last * reach, reach)[0]
         found.append((since_s, until_s))
     return found
 

@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from companion.core.boom import Boom
-from companion.core.crossings import Crossing, Route, boom_route, bridged
+from companion.core.crossings import Crossing, Route, rate_at
 from companion.core.nozzle import FlowCurve, NozzleSet, dosing_of, overdrive_of, speed_soon
-from companion.core.schedule import LagModel, Timing, rate_at, resolve, schedule, sticky_border_s
+from companion.core.options.whole_boom import boom_route, bridged
+from companion.core.schedule import LagModel, Timing, resolve, schedule, sticky_border_s
 from companion.core.types import (
     DriveChange,
     DrivePlan,

@@ -10,7 +10,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely import Geometry, MultiPolygon, Polygon
 
-from companion.core.prescription import dissolved, without_overlay
+from companion.core.outline import dissolved, without_overlay
 from missions.maps.build import frame_for
 from missions.maps.cells import cell_areas_m2, cell_size_m, to_degrees
 from missions.maps.local import make_valid, project, project_all
