@@ -34,7 +34,7 @@ from missions.sheet import scheduled
 from missions.sorties import Flying, SortieSearch
 from missions.spacing import Spacing
 from missions.speeds import choices, chosen, crawl_warnings, short_warnings, stretches_of
-from missions.stops import near_warnings, timed
+from missions.stops import near_warnings
 from missions.strips import (
     Bools,
     Extents,
@@ -455,7 +455,7 @@ def _lasting(
     for _ in range(ROUNDS):
         # Most of what the search does not know shows before speeds and ways are made as they are
         # flown, which takes far longer.
-        used_wh = [wh / ROUGHLY for wh in each_wh(timed(sorties, settings), settings)]
+        used_wh = [wh / ROUGHLY for wh in each_wh(search.timed(sorties), settings)]
         if max(used_wh) <= usable_wh:
             found = pace(sorties)
             used_wh = each_wh(found.sorties, settings)

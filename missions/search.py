@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from missions.network import Network
-from missions.searching import steps
+from missions.searching import below, steps
 from missions.tour import Lasts, Sortie, turned
 
 # The first moves may cost some twenty seconds of flight, the last ones next to nothing.
@@ -104,9 +104,9 @@ def improve(
 
 def _attempt(state: _State, draw: random.Random, allowed: float) -> float:
     """Try to bring an end and a near one together; return what it cost, 0 where it was left."""
-    end = draw.randrange(state.depot)
+    end = below(draw, state.depot)
     near = state.near[end]
-    other = near[draw.randrange(len(near))]
+    other = near[below(draw, len(near))]
     if end >> 1 == other >> 1:
         return 0.0
     kind = draw.random()

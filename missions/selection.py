@@ -22,6 +22,7 @@ from missions.boom import SLACK_M, Boom, where_inside
 from missions.corners import Motion
 from missions.coverage import reachable
 from missions.open_lines import edges_along, evenly
+from missions.searching import below
 from missions.strips import Floats, axes, directions, joined, lengths_m
 
 # The ground is looked at in so many points, one for 2.5 m2 of a hectare.
@@ -277,11 +278,13 @@ class _Set:
         cooling = (COLD_S / HOT_S) ** (1.0 / moves)
         for _ in range(moves):
             heat *= cooling
-            undo = self._move(draw)
+            counts = (list(self._digits), self._treated, self._bare, self._doubled)
+            changed = self._move(draw)
             value_s = self.value_s()
             if value_s - now_s > -heat * math.log(1.0 - draw.random()):
-                for line in undo[::-1]:
-                    self._flip(line)
+                for line in changed[::-1]:
+                    self._note(line)
+                self._digits, self._treated, self._bare, self._doubled = counts
                 continue
             now_s = value_s
             if now_s < best_s - 1e-9:
@@ -292,7 +295,7 @@ class _Set:
         """Change the set; return the lines that were taken or dropped, in order."""
         kind, changed = draw.random(), []
         if kind < 0.75 and self._taken:
-            changed.append(self._taken[draw.randrange(len(self._taken))])
+            changed.append(self._taken[below(draw, len(self._taken))])
             self._flip(changed[0])
         if kind > 0.25:
             line = self._drawn(draw, changed)
@@ -307,9 +310,18 @@ class _Set:
         bare = some & ~self._treated
         if not bare:
             return None
-        point = _set_bit(bare, draw.randrange(bare.bit_count()))
+        point = _set_bit(bare, below(draw, bare.bit_count()))
         first, end = self._first[point], self._first[point + 1]
-        return self._over[first + draw.randrange(end - first)] if end > first else None
+        return self._over[first + below(draw, end - first)] if end > first else None
+
+    def _note(self, line: int) -> None:
+        """Have a line taken or dropped again, but for what is counted of the points."""
+        if line in self._taken:
+            self._taken.remove(line)
+            self._spent_s -= self._cost_s[line]
+        else:
+            self._taken.append(line)
+            self._spent_s += self._cost_s[line]
 
     def _flip(self, line: int) -> None:
         if line in self._taken:

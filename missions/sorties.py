@@ -129,10 +129,8 @@ class SortieSearch:
             pieces = self._pieces
             parts = [_part(passes, pieces, 2 * at) for at in range(len(pieces))]
             raise _too_far(passes, limits, parts, self.ways, settings)
-        drawn = [self._as_flown(each) for each in found]
-        if len(drawn) == 1:
-            return drawn[0]
-        return min(drawn, key=lambda each: _total_s(each[1], settings))
+        drawn = map(self._as_flown, found)
+        return min(drawn, key=lambda each: _total_s(self.timed(each[1]), settings))
 
     def with_less(
         self, parts: Sequence[list[Part]], used_wh: Sequence[float], usable_wh: float
@@ -159,6 +157,16 @@ class SortieSearch:
             return None
         kept = [each for at, each in enumerate(parts) if at not in group]
         return self._as_flown([*kept, *found[0]])
+
+    def timed(self, sorties: Sequence[Sortie]) -> tuple[Sortie, ...]:
+        """Return the sorties with the seconds of each leg; they are asked for more than once."""
+        new = [each for each in sorties if each not in self._timed]
+        self._timed.update(zip(new, timed(new, self.settings), strict=True))
+        return tuple(map(self._timed.__getitem__, sorties))
+
+    @cached_property
+    def _timed(self) -> dict[Sortie, Sortie]:
+        return {}
 
     def _as_flown(self, parts: list[list[Part]]) -> tuple[list[list[Part]], tuple[Sortie, ...]]:
         """Return the parts in the order of their sorties, and these."""
@@ -285,13 +293,13 @@ def _as_pieces(passes: Passes, sorties: list[list[Part]]) -> tuple[Pieces, list[
 
 
 def _total_s(sorties: tuple[Sortie, ...], settings: Settings) -> float:
-    """Return the time of sorties as they are flown, landings and refills among it."""
+    """Return the time of timed sorties as they are flown, landings and refills among it."""
     landing_s = settings.upright_s + settings.refill_s
     return sum(
         sortie.flight_s
         + landing_s
         + nose_s(sortie.legs, turn=settings.turn, rate_deg_s=settings.nose_rate_deg_s)
-        for sortie in timed(sorties, settings)
+        for sortie in sorties
     )
 
 

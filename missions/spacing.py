@@ -172,8 +172,10 @@ class Spacing:
         # One that is mended may leave another one beside it.
         while len(tried) < PAIRS_MAX and (new := [pair for pair in near if pair not in tried]):
             tried.add(new[0])
-            again = replace(best, legs=self._with_another_way(sortie.legs, best.legs, new[0]))
-            left = self._near(again)
+            legs = self._with_another_way(sortie.legs, best.legs, new[0])
+            if legs is best.legs:
+                continue
+            left = self._near(again := replace(best, legs=legs))
             if len(left) < len(near):
                 best, near = again, left
         return best, near
@@ -372,11 +374,9 @@ def _at(legs: Sequence[Leg], pair: Pair) -> frozenset[int]:
         number
         for number, leg in enumerate(legs)
         if leg.kind != "spray"
-        and any(
-            math.dist(one, place) < TOUCH_M
-            for one in (*leg.points, _middle(leg.points[0], leg.points[-1]))
-            for place in pair
-        )
+        for one in (*leg.points, _middle(leg.points[0], leg.points[-1]))
+        for place in pair
+        if abs(one[0] - place[0]) < TOUCH_M and math.dist(one, place) < TOUCH_M
     )
 
 
