@@ -146,9 +146,13 @@ def progress(*, quiet: bool = False, after_s: float = 0.0) -> Iterator[Tell]:
                 if time.monotonic() < seen_s:
                     return
                 bars.append(shown.enter_context(_bar()))
-                bars[0].add_task(what)
-            task = bars[0].task_ids[0]
-            bars[0].update(task, description=what, completed=done, total=total)
+                bars[0].add_task(what, total=total)
+            bar = bars[0]
+            (task,) = bar.tasks
+            if task.total != total or done < task.completed:
+                # A count that begins anew is another piece of work: so does its time.
+                bar.reset(task.id, total=total, description=what)
+            bar.update(task.id, description=what, completed=done, total=total)
 
         yield tell
 

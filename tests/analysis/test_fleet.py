@@ -17,6 +17,7 @@ from analysis.fleet.adding import add, journals_in
 from analysis.fleet.asking import asked
 from analysis.fleet.flight_row import COLUMNS, operator_number, recorded
 from analysis.fleet.store import Store
+from companion.cli import answer
 from companion.cli.app import execute
 from companion.errors import ConfigError
 from companion.journal.journal import Journal
@@ -122,6 +123,46 @@ def test_what_was_done_before_an_interrupt_is_kept_and_gone_on_with(
     assert (then.added, then.evaluated) == ((3, 5) if is_reading else (0, 3))
     taken(several, tmp_path / "whole")
     assert contents(tmp_path / "f") == contents(tmp_path / "whole")
+
+
+def test_a_journal_that_goes_on_between_the_steps_is_read_anew(flown: Path, tmp_path: Path) -> None:
+    """What was read in the first step is taken in the second only of the very same file."""
+    path = earlier(flown, tmp_path / "flight-0001.gpkg")
+
+    def go_on(what: str, _done: int, _total: int) -> None:
+        if what == "reading journals":
+            shutil.copyfile(flown, path)
+
+    assert taken([path], tmp_path / "f", tell=go_on).evaluated == 1
+    taken([flown], tmp_path / "whole")
+    (row,), (whole,) = rows(tmp_path / "f"), rows(tmp_path / "whole")
+    for name in ("journal_state", "entries", "journal_sha256", "applied_l", "changes"):
+        assert row[name] == whole[name], name
+
+
+def test_flights_over_other_ground_have_a_map_of_their_own(flown: Path, tmp_path: Path) -> None:
+    """Set-ups are kept by their ground too: not by what a journal says of its map."""
+    other = copied(flown, tmp_path / "j" / "flight-0002.gpkg", started(9))
+    change(other, {}, "UPDATE zones SET rate_l_ha = rate_l_ha * 2.0")
+    taken([copied(flown, tmp_path / "j" / "flight-0001.gpkg", started(8)), other], tmp_path / "f")
+    one, two = rows(tmp_path / "f")
+    assert one["prescribed_l"] > 0.0
+    assert two["prescribed_l"] == pytest.approx(2.0 * one["prescribed_l"])
+
+
+def test_each_step_has_a_bar_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    bars = []
+    make = answer._bar
+    monkeypatch.setattr(answer, "_bar", lambda: bars.append(make()) or bars[0])
+    with answer.progress() as tell:
+        for done in range(1, 6):
+            tell("reading journals", done, 5)
+        (task,) = bars[0].tasks
+        assert (task.description, task.completed, task.finished) == ("reading journals", 5, True)
+        tell("evaluating flights", 1, 5)
+        (task,) = bars[0].tasks
+        assert (task.description, task.completed, task.finished) == ("evaluating flights", 1, False)
 
 
 def test_a_row_says_what_the_report_says(
