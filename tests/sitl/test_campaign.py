@@ -234,10 +234,10 @@ def test_the_bound_of_a_flight_ends_with_it() -> None:
 
 ENDLESS = """
 import threading
-from sitl.campaign import executors
+from sitl.campaign import running
 
-executors.WALL_TIMES, executors.GRACE_S = 1.0, 0.1
-with executors._bounded(1.0):
+running.WALL_TIMES, executors.GRACE_S = 1.0, 0.1
+with running._bounded(1.0):
     threading.Event().wait()
 """
 
