@@ -100,6 +100,12 @@ def is_wgs84(crs: CRS) -> bool:
     return bool(crs.to_epsg() == 4326)
 
 
+@lru_cache(maxsize=32)
+def _into_degrees(crs: CRS) -> Transformer:
+    # PROJ looks for the best way each time, for 30 ms; the files of a map mostly share their CRS.
+    return Transformer.from_crs(crs, WGS84, always_xy=True)
+
+
 def to_longitude_latitude(geometries: Objects, crs: CRS, *, path: Path) -> Objects:
     """Return the geometries in WGS84 longitude and latitude, or refuse what cannot lie there."""
     coordinates = shapely.get_coordinates(geometries)
@@ -113,7 +119,7 @@ def to_longitude_latitude(geometries: Objects, crs: CRS, *, path: Path) -> Objec
     if is_wgs84(crs):
         check_place(coordinates, coordinates, crs, path)
         return geometries
-    transformer = Transformer.from_crs(crs, WGS84, always_xy=True)
+    transformer = _into_degrees(crs)
 
     def transform(points: Floats) -> Floats:
         return np.column_stack(transformer.transform(points[:, 0], points[:, 1]))
@@ -325,6 +331,7 @@ def _own(crs: CRS) -> CRS:
     return crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
 
 
+@lru_cache(maxsize=64)
 def _epsg(crs: CRS, *, confidence: int = 70) -> int | None:
     own = _own(crs)
     code: int | None = own.to_epsg() or own.to_epsg(min_confidence=confidence)
@@ -361,7 +368,7 @@ def _degrees_outside(points: Floats, area: _Box) -> float:
 
 def _fits_exchanged(raw: Floats, crs: CRS, area: _Box) -> bool:
     """Tell whether the map would lie inside the area with x and y exchanged."""
-    transformer = Transformer.from_crs(crs, WGS84, always_xy=True)
+    transformer = _into_degrees(crs)
     points = np.column_stack(transformer.transform(raw[:, 1], raw[:, 0]))
     return bool(np.isfinite(points).all()) and _degrees_outside(points, area) == 0.0
 

@@ -208,8 +208,8 @@ def test_the_shipped_action_file_has_the_buttons_that_the_page_names() -> None:
 
 @pytest.mark.timeout(400)
 def test_the_commands_of_a_real_field_run_one_after_the_other(tmp_path: Path) -> None:
-    """The page's data are others' and not here: a made-up image takes their name, on 0.2 ha."""
-    outline = [(0.0, 0.0), (60.0, 0.0), (60.0, 36.0), (0.0, 36.0)]
+    """The page's data are others' and not here: a made-up image takes their name, on 0.1 ha."""
+    outline = [(0.0, 0.0), (40.0, 0.0), (40.0, 24.0), (0.0, 24.0)]
     east_m, north_m = 284_000.0, 6_131_000.0  # GDA94, MGA zone 54
     ground = shapely.Polygon([(east_m + x, north_m + y) for x, y in outline])
     name = "area1_onebox_94mga54.shp"
@@ -218,7 +218,7 @@ def test_the_commands_of_a_real_field_run_one_after_the_other(tmp_path: Path) ->
         geometry_type="Polygon", crs="EPSG:28354",
     )  # fmt: skip
     values = np.full((16, 26), 0.2)
-    values[:, 13:] = 0.3
+    values[:, 9:] = 0.3
     with rasterio.open(
         tmp_path / "area1_onebox_NDVI_250cm.tif", "w", driver="GTiff", width=26, height=16,
         count=1, dtype="float64", crs="EPSG:28354",
