@@ -17,6 +17,9 @@ from sitl.campaign.bundle import Bundle, unpack
 from sitl.campaign.dataset import read_columns
 from tests.sitl.campaign_files import OwnProcess, write_campaign
 
+# The end of the mission, and a place on the way to it.
+SHORTER = ("35.9963478\t114.5435887", "35.9961495\t114.5435369")
+
 
 class Interrupted(OwnProcess):
     """Flies in this process until somebody presses Ctrl-C."""
@@ -34,6 +37,9 @@ def test_what_was_flown_is_kept_and_the_same_command_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file, out = write_campaign(tmp_path, "seeds = 24\n"), tmp_path / "out"
+    # A few metres are a flight, too.
+    mission = tmp_path / "field" / "short.waypoints"
+    mission.write_text(mission.read_text().replace(*SHORTER))
     kinds = [Interrupted, OwnProcess]
 
     @contextmanager

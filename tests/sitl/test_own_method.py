@@ -238,7 +238,7 @@ def test_what_cannot_be_loaded_is_one_line(
 
 
 def test_the_ten_lines_of_the_page_fly_as_it_says(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured, one_pass: None
 ) -> None:
     page = PAGE.read_text()
     code = re.findall(r"```python\n(.*?)```", page, re.DOTALL)[0]
@@ -257,9 +257,7 @@ def test_the_ten_lines_of_the_page_fly_as_it_says(
     assert sorted(path.name for path in Path("flown").iterdir()) == [
         "flight.png", "result.json", "truth.npz",
     ]  # fmt: skip
-    # As quick as two processes that import first; and the names of methods do for one pass too.
-    monkeypatch.setattr("sitl.workers.PROCESSES_MAX", 1)
-    monkeypatch.setattr("sitl.anyang.PASS_COUNT", 1)
+    monkeypatch.setattr("sitl.workers.PROCESSES_MAX", 1)  # as quick as two that import first
     assert execute([*commands[0].split()[1:], "--json"]) == 0
     flights = json.loads(capsys.readouterr().out)["flights"]
     assert [each["method"] for each in flights] == [
