@@ -58,6 +58,10 @@ CONTRACT_KEYS = {
 }
 
 
+# Of four rows of plots the two in the middle; across the field, from its edge.
+ROWS_FLOWN_M = (9.0, 15.0)
+
+
 @dataclass(frozen=True)
 class Shown:
     result: DemoResult
@@ -68,7 +72,10 @@ class Shown:
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory: pytest.TempPathFactory) -> Shown:
-    """Return what the command made, in one process: `test_wheel.py` flies with its pool."""
+    """Return what the command made of two passes, there and back, in one process.
+
+    `test_tutorial.py` flies all four of them in a pool of processes.
+    """
     out = tmp_path_factory.mktemp("demo") / "made" / "demo"
     told: list[int] = []
     results: list[DemoResult] = []
@@ -83,8 +90,11 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Shown:
 
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as said:
         patch.setattr("sitl.demo.fly_demo", fly_here)
+        patch.setattr("sitl.anyang.PASS_COUNT", len(ROWS_FLOWN_M))
+        demo_trajectory.cache_clear()
         with redirect_stderr(StringIO()) as noise:
             code = execute(["demo", "--out", str(out), *ONE, "--json"])
+    demo_trajectory.cache_clear()
     assert (code, noise.getvalue()) == (0, "")
     return Shown(results[0], out, len(told), said.getvalue())
 
@@ -254,10 +264,14 @@ def test_raster_of_scheduled_is_the_map(shown: Shown) -> None:
     axes = field_axes(setup)
     traces = next(f.traces for f in shown.result.flights if f.job.method == "scheduled")
     assert traces is not None
-    for zone in setup.prescription.zones:
-        x_m, y_m = axes.place(
-            np.array([zone.polygon.centroid.x]), np.array([zone.polygon.centroid.y])
-        )
+    places = [
+        (zone, axes.place(np.array([middle.x]), np.array([middle.y])))
+        for zone in setup.prescription.zones
+        for middle in [zone.polygon.centroid]
+    ]
+    flown = [each for each in places if np.abs(each[1][1] - ROWS_FLOWN_M).min() < 1.0]
+    assert len(flown) == len(places) / 2 == 20
+    for zone, (x_m, y_m) in flown:
         rows, columns = traces.applied_l_ha.shape
         column = int((x_m[0] + (columns * CELL_M - axes.length_m) / 2) / CELL_M)
         row = int((y_m[0] + (rows * CELL_M - axes.width_m) / 2) / CELL_M)
