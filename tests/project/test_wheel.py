@@ -63,11 +63,9 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-# The demo needs each of its files for one pass too, and `test_tutorial.py` flies all four of them
-# in a pool of processes.
-BRIEFLY = (
-    "import sitl.anyang, sitl.workers; sitl.anyang.PASS_COUNT = sitl.workers.PROCESSES_MAX = 1; "
-)
+# The demo needs each of its files for two passes too, and `test_tutorial.py` flies all four in a
+# pool of processes.
+BRIEFLY = "import sitl.anyang as a, sitl.workers as w; a.PASS_COUNT, w.PROCESSES_MAX = 2, 1; "
 
 
 def vrspray(

@@ -10,10 +10,10 @@ from sitl.anyang import demo_trajectory
 
 
 @pytest.fixture
-def one_pass() -> Iterator[None]:
-    """Fly one pass of four over the example's field: for what does not depend on how many."""
+def two_passes() -> Iterator[None]:
+    """Fly there and back over the two middle rows of the example's plots, not over all four."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sitl.anyang.PASS_COUNT", 1)
+        patch.setattr("sitl.anyang.PASS_COUNT", 2)
         demo_trajectory.cache_clear()
         yield
     demo_trajectory.cache_clear()

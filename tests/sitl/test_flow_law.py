@@ -119,7 +119,7 @@ def test_without_knowledge_the_same_valves_differ() -> None:
     assert np.ptp(np.diff(plant.volume_ml(np.array([5.0, 10.0])), axis=0)) > 0.5
 
 
-def test_a_flight_takes_the_law_that_it_is_given(one_pass: None) -> None:
+def test_a_flight_takes_the_law_that_it_is_given(two_passes: None) -> None:
     setup, path = demo_setup(12.0), demo_trajectory(12.0, 1)
     volumes = set()
     for law in (None, *FLOW_LAWS):

@@ -238,7 +238,7 @@ def test_what_cannot_be_loaded_is_one_line(
 
 
 def test_the_ten_lines_of_the_page_fly_as_it_says(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured, one_pass: None
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured, two_passes: None
 ) -> None:
     page = PAGE.read_text()
     code = re.findall(r"```python\n(.*?)```", page, re.DOTALL)[0]
