@@ -236,7 +236,7 @@ ENDLESS = """
 import threading
 from sitl.campaign import running
 
-running.WALL_TIMES, executors.GRACE_S = 1.0, 0.1
+running.WALL_TIMES, running.GRACE_S = 1.0, 0.1
 with running._bounded(1.0):
     threading.Event().wait()
 """
