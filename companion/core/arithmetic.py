@@ -17,6 +17,8 @@ from operator import mul
 _LN_2_HIGH, _LN_2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 _LOG2_E = 1.4426950408889634
 _EXP_MAX = 700.0
+# Below half of ln 2 nothing is halved: most that is asked for.
+_NO_HALVING = 0.34
 _SQRT_HALF = 0.7071067811865476
 
 
@@ -26,10 +28,12 @@ def exp(x: float) -> float:
     >>> exp(0.0), exp(-800.0), abs(exp(1.0) - 2.718281828459045) < 1e-15
     (1.0, 0.0, True)
     """
-    if not abs(x) <= _EXP_MAX:
-        return 0.0 if x < 0.0 else x * math.inf
-    halvings = round(x * _LOG2_E)
-    r = (x - halvings * _LN_2_HIGH) - halvings * _LN_2_LOW
+    halvings = 0
+    if not abs(x) < _NO_HALVING:
+        if not abs(x) <= _EXP_MAX:
+            return 0.0 if x < 0.0 else x * math.inf
+        halvings = round(x * _LOG2_E)
+    r = (x - halvings * _LN_2_HIGH) - halvings * _LN_2_LOW if halvings else x
     # The series to r^13 / 13!; what is left out is below 1e-17 for |r| <= ln 2 / 2.
     tail = 1.0 / 40_320.0 + r * (
         1.0 / 362_880.0
@@ -40,7 +44,8 @@ def exp(x: float) -> float:
         )
     )
     head = 1.0 / 24.0 + r * (1.0 / 120.0 + r * (1.0 / 720.0 + r * (1.0 / 5040.0 + r * tail)))
-    return math.ldexp(1.0 + r * (1.0 + r * (0.5 + r * (1.0 / 6.0 + r * head))), halvings)
+    found = 1.0 + r * (1.0 + r * (0.5 + r * (1.0 / 6.0 + r * head)))
+    return math.ldexp(found, halvings) if halvings else found
 
 
 def log(x: float) -> float:

@@ -144,6 +144,11 @@ class Paths(NamedTuple):
     step_north_m: Floats
     length_m: Floats
 
+    def chord_of(self, point: int, chord: int) -> tuple[Sequence[float], Sequence[float]]:
+        """Return when a chord of a point's path begins and ends, and how fast it is then."""
+        both = slice(chord, chord + 2)
+        return self.time_s[both], self.speed_m_s[point, both].tolist()
+
 
 def box_of(middle: tuple[tuple[float, float], ...], reach_m: float) -> Box:
     """Return west, south, east, north of all within `reach_m` of the middle's path."""
@@ -225,9 +230,13 @@ def turning_of(state: VehicleState) -> Turning:
 
 def speed_shares(state: VehicleState, boom: Boom, dt_s: float) -> list[float]:
     """Return how fast each valve goes `dt_s` from now, beside the position reference."""
-    turned_deg, yaw = turning_of(state).after(dt_s)
+    now = turning_of(state)
+    # What fades is never faster later on; mostly the nose stands.
+    if not now.fastest_deg_s > STEADY_YAW_RATE_DEG_S:
+        return [1.0] * len(boom.valves)
+    turned_deg, yaw = now.after(dt_s)
     if not yaw.fastest_deg_s > STEADY_YAW_RATE_DEG_S:
-        return [1.0] * len(boom.right_m)
+        return [1.0] * len(boom.valves)
     ae, an = state.acceleration_east_m_s2, state.acceleration_north_m_s2
     east, north, _, _ = _carried(state, dt_s, ae, an)
     angle = math.radians((state.heading_deg or 0.0) + turned_deg)
@@ -381,7 +390,7 @@ def time_on_chord(
     """Return when the path is `s` metres along a chord of that length, and its speed there.
 
     Speed changes evenly along a chord: s = v0 t + (v1 - v0) t^2 / 2T, scaled to the chord's end
-    (as in `crossings._cut`).
+    (as in `crossings._at`).
     """
     (t0, t1), (v0, v1) = times_s, speeds_m_s
     if not v0 + v1 > 1e-9:

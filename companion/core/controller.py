@@ -42,10 +42,10 @@ from companion.core.options.treated_area import TreatedArea
 from companion.core.options.valve_tracking import TrackMemory
 from companion.core.safety import UNASKED, Permission, closed_plan, guard, permit, shown
 from companion.core.schedule import (
+    STICKY_S,
     Dosing,
     ValveSchedule,
     in_zone,
-    is_in_zone,
     schedule,
     sticky_border_s,
 )
@@ -363,6 +363,8 @@ def _orders(
     overdrive = overdrive_of(setup, index)
     sticky_s = sticky_border_s(setup.border_buffer_m, speed_m_s)
     until_s = now_s + setup.lease_s
+    # A crossing after this is for no order of this step, nor does it hold one back.
+    free_s = max(until_s, now_s + STICKY_S) + setup.longest_s
     is_early, own_routes = False, routes
     if setup.pumping is not None:
         own_routes, is_early = sections(
@@ -373,7 +375,8 @@ def _orders(
     for valve, route in enumerate(own_routes):
         own = shares[valve]
         of_valve = dosing(valve) if setup.pumping is None else on_off
-        if is_in_zone(route, longest_s=setup.longest_s, now_s=now_s, until_s=until_s):
+        # Of several crossings a stay may be too short, which is counted.
+        if len(route) == 1 or (len(route) == 2 and route[1].at_s > free_s):
             # Neighbours in the middle of one zone do the same.
             key = (route[0].rate_l_ha, own, in_force[valve], of_valve)
             made = (
@@ -537,8 +540,7 @@ def _flow(setup: Setup, plan: SprayPlan, nozzles: NozzleSet) -> float:
     """Return the flow [L/min] that the table says of the duties in force from now on."""
     now = _in_force(setup, liquid_of(setup.pumping, plan), plan.issued_s)
     flows = {duty: nozzles.curve.flow_for(duty) for duty in set(now)}
-    shares = nozzles.shares or (1.0,) * len(nozzles.valves)
-    of_each = [
-        flows[now[valve]] * share for valve, share in zip(nozzles.valves, shares, strict=True)
-    ]
+    of_each = [flows[now[valve]] for valve in nozzles.valves]
+    if nozzles.shares:
+        of_each = [flow * share for flow, share in zip(of_each, nozzles.shares, strict=True)]
     return sum(of_each) / len(of_each)

@@ -82,26 +82,20 @@ def rate_at(route: Sequence[Crossing], now_s: float) -> float | None:
     return rate
 
 
-class _Cut(NamedTuple):
-    """A path cuts an edge: which polygon (`owner`), and whether it is entered."""
-
-    at_s: float
-    along_m: float
-    speed_m_s: float
-    owner: int
-    enters: bool
+# A path cuts an edge: its way until there (rounded to um), whether the edge's polygon is entered,
+# the way, whose polygon that is, on which chord, and at which share of it. As they are sorted,
+# leaving comes before entering, where both are at one place.
+_Cut = tuple[int, bool, float, int, int, float]
+# When a chord of a point's path (its number, and the chord's) begins and ends, and how fast then.
+_ChordOf = Callable[[int, int], tuple[Sequence[float], Sequence[float]]]
 
 
-def _cut(
-    times_s: tuple[float, float], v0: float, v1: float, gone: float, s: float, reach_m: float,
-    owner: int, enters: bool,
-) -> _Cut:  # fmt: skip
-    """Return the cut `s` metres along a chord, before which the path has `gone` so far."""
-    share, v0_2 = s / reach_m, v0 * v0
+def _at(chord: tuple[Sequence[float], Sequence[float]], share: float) -> tuple[float, float]:
+    """Return when the path is at a share of a chord, and how fast."""
+    (t0, t1), (v0, v1) = chord
+    v0_2 = v0 * v0
     speed = math.sqrt(v0_2 + (v1 * v1 - v0_2) * share)
-    t0, t1 = times_s
-    at_s = t0 + share * (v0 + v1) / max(v0 + speed, 1e-9) * (t1 - t0)
-    return _Cut(at_s, gone + s, speed, owner, enters)
+    return t0 + share * (v0 + v1) / max(v0 + speed, 1e-9) * (t1 - t0), speed
 
 
 # Where a path meets an edge: chord, rounded way along it, whether its polygon is entered, point,
@@ -120,12 +114,10 @@ def _cuts(paths: Paths, ends: Floats, owner: Ints) -> list[list[_Cut]]:
     if not met:
         return found
     met.sort()
-    pace, along = paths.speed_m_s.tolist(), np.cumsum(paths.length_m, axis=1).tolist()
-    for chord, _, enters, point, s, reach_m, who in met:
-        times_s = paths.time_s[chord], paths.time_s[chord + 1]
+    along = np.cumsum(paths.length_m, axis=1).tolist()
+    for chord, place, enters, point, s, reach_m, who in met:
         gone = along[point][chord - 1] if chord else 0.0
-        v0, v1 = pace[point][chord : chord + 2]
-        found[point].append(_cut(times_s, v0, v1, gone, s, reach_m, who, enters))
+        found[point].append((place, enters, gone + s, who, chord, s / reach_m))
     return found
 
 
@@ -134,12 +126,12 @@ def _cuts_of_pass(way: Pass, edges: list[PlainEdge]) -> list[list[_Cut]]:
 
     Only points between the ends of an edge, seen along the way, can meet it.
     """
-    points, (v0, v1) = way.points, way.speed_m_s
+    points = way.points
     _, _, way_e, way_n, _, _ = points[0]
     in_order = sorted([(way_e * p[1] - way_n * p[0], i) for i, p in enumerate(points)])
     sides = [side for side, _ in in_order]
     least, most = sides[0] - SAME_SIDE_M2, sides[-1] + SAME_SIDE_M2
-    met: list[list[tuple[int, bool, float, float, int]]] = [[] for _ in points]
+    met: list[list[_Cut]] = [[] for _ in points]
     for x0, y0, x1, y1, who in edges:
         low, high = way_e * y0 - way_n * x0, way_e * y1 - way_n * x1
         if low > high:
@@ -157,13 +149,10 @@ def _cuts_of_pass(way: Pass, edges: list[PlainEdge]) -> list[list[_Cut]]:
             s += (y0 + share * (y1 - y0) - py) * dy
             s /= max(reach_m, 1e-12)
             if START_NUDGE_M < s <= reach_m:
-                met[point].append((round(s * 1e6), a > b, s, reach_m, who))
+                met[point].append((round(s * 1e6), a > b, s, who, 0, s / reach_m))
     for each in met:
         each.sort()
-    return [
-        [_cut(way.time_s, v0, v1, 0.0, s, reach, who, enters) for _, enters, s, reach, who in each]
-        for each in met
-    ]
+    return met
 
 
 def _met(paths: Paths, ends: Floats, owner: Ints) -> list[_Met]:
@@ -225,14 +214,14 @@ def find_routes(
     paths = predict(state, boom.right_m, boom.forward_m, back_s=back_s, ahead_s=ahead_s)
     ends, owner = prescription.edges_near(*box_of(paths.middle, reach_m))
     bases = prescription.owners_at(*_starts(paths))
-    cuts = _cuts(paths, ends, owner)
+    cuts, chord_of = _cuts(paths, ends, owner), paths.chord_of
     speeds = paths.speed_m_s[:, [0, -1]].tolist()
     span_s = paths.time_s[0], paths.time_s[-1]
     if across == "centre":
-        rates = _rates(prescription, span_s[0], speeds, bases, cuts)
+        rates = _rates(prescription, chord_of, bases, cuts)
     else:
         rates = _rates_across(prescription, state, boom, (ends, owner), across, back_s, ahead_s)
-    closed = _centres_outside(bases, cuts, span_s[0])
+    closed = _centres_outside(chord_of, bases, cuts)
     if border == "inside":
         edges = ends[owner == FIELD]
         if drift_m is not None:
@@ -259,9 +248,14 @@ def _routes_of_pass(
     edges = near.edges_in(box)
     bases = prescription.owners_near(near, *_starts_of_pass(way))
     cuts = _cuts_of_pass(way, edges)
+    every_chord = (way.time_s, way.speed_m_s)
+
+    def chord_of(_point: int, _chord: int) -> tuple[Sequence[float], Sequence[float]]:
+        return every_chord
+
     speeds = [way.speed_m_s] * len(way.points)
-    rates = _rates(prescription, way.time_s[0], speeds, bases, cuts)
-    closed = _centres_outside(bases, cuts, way.time_s[0])
+    rates = _rates(prescription, chord_of, bases, cuts)
+    closed = _centres_outside(chord_of, bases, cuts)
     if border == "inside":
         edges = [edge for edge in edges if edge[4] == FIELD]
         add_contacts_of_pass(way, edges, boom, border_buffer_m, closed)
@@ -275,32 +269,31 @@ _Steps = list[Crossing]
 
 def _rates(
     prescription: Prescription,
-    start_s: float,
-    speeds: Sequence[Sequence[float]],
+    chord_of: _ChordOf,
     bases: Sequence[Set[int]],
     found: list[list[_Cut]],
 ) -> list[_Steps]:
     """Return the rate along each point's path."""
     timelines = []
-    for base, cuts, (pace, _) in zip(bases, found, speeds, strict=True):
+    for point, (base, cuts) in enumerate(zip(bases, found, strict=True)):
         inside = set(base)
         inside.discard(FIELD)
         rate = prescription.rate_of(frozenset(inside))
+        (start_s, _), (pace, _) = chord_of(point, 0)
         steps = [Crossing(start_s, rate, False, pace)]
         timelines.append(steps)
-        if not cuts:
-            continue
-        zone_cuts = [cut for cut in cuts if cut.owner != FIELD]
-        for i, cut in enumerate(zone_cuts):
-            if cut.enters:
-                inside.add(cut.owner)
+        zone_cuts = [cut for cut in cuts if cut[3] != FIELD] if cuts else cuts
+        for i, (_, enters, along_m, owner, chord, share) in enumerate(zone_cuts):
+            if enters:
+                inside.add(owner)
             else:
-                inside.discard(cut.owner)
-            if i + 1 < len(zone_cuts) and zone_cuts[i + 1].along_m - cut.along_m < SLIVER_M:
+                inside.discard(owner)
+            if i + 1 < len(zone_cuts) and zone_cuts[i + 1][2] - along_m < SLIVER_M:
                 continue  # the next zone begins here: a gap this narrow is none
             new = prescription.rate_of(frozenset(inside))
             if new != rate:
-                steps.append(Crossing(cut.at_s, new, False, cut.speed_m_s))
+                at_s, speed = _at(chord_of(point, chord), share)
+                steps.append(Crossing(at_s, new, False, speed))
                 rate = new
     return timelines
 
@@ -343,9 +336,8 @@ def _rates_across(
     right = (boom.right_m[:, None] + boom.half_width_m[:, None] * shares).ravel()
     forward = np.repeat(boom.forward_m, count)
     paths = predict(state, right, forward, back_s=back_s, ahead_s=ahead_s)
-    speeds = paths.speed_m_s[:, [0, -1]].tolist()
     bases = prescription.owners_at(*_starts(paths))
-    every = _rates(prescription, paths.time_s[0], speeds, bases, _cuts(paths, *edges))
+    every = _rates(prescription, paths.chord_of, bases, _cuts(paths, *edges))
     timelines = []
     for valve in range(len(boom.valves)):
         parts = every[valve * count : (valve + 1) * count]
@@ -386,22 +378,21 @@ def _across(width_m: float) -> tuple[Floats, list[float]]:
 
 
 def _centres_outside(
-    bases: Sequence[Set[int]], found: list[list[_Cut]], start_s: float
+    chord_of: _ChordOf, bases: Sequence[Set[int]], found: list[list[_Cut]]
 ) -> list[Intervals]:
     """Return when the centre of each strip is outside the field."""
     closed = []
-    for base, cuts in zip(bases, found, strict=True):
+    for point, (base, cuts) in enumerate(zip(bases, found, strict=True)):
         intervals: Intervals = []
         closed.append(intervals)
-        inside, since_s = FIELD in base, start_s
-        for cut in cuts:
-            if cut.owner != FIELD:
+        inside, since_s = FIELD in base, chord_of(point, 0)[0][0]
+        for _, enters, _, owner, chord, share in cuts:
+            if owner != FIELD or enters is inside:
                 continue
-            if inside and not cut.enters:
-                inside, since_s = False, cut.at_s
-            elif not inside and cut.enters:
-                inside = True
-                intervals.append((since_s, cut.at_s))
+            at_s, _ = _at(chord_of(point, chord), share)
+            if enters:
+                intervals.append((since_s, at_s))
+            inside, since_s = enters, at_s
         if not inside:
             intervals.append((since_s, math.inf))
     return closed

@@ -465,11 +465,11 @@ def dosing_by_valve(
     `dose` makes the dosing of a set and of a valve's share. A rate that only the sides of the boom
     meet is sprayed with the set in use: the boom's middle decides.
     """
-    chosen = dict(of_rate)
-    is_one = len({in_use, *chosen.values()}) == 1
+    is_one = all(number == in_use for _, number in of_rate)
     if is_one and not sets[in_use].shares:
         members, one = sets[in_use].valves, dose(in_use, 1.0)
         return lambda valve: one if valve in members else _shut
+    chosen = dict(of_rate)
     known: dict[tuple[int, float], Dosing] = {}
 
     def member(number: int, valve: int) -> Dosing:

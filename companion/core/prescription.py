@@ -65,7 +65,7 @@ class Edges:
 
 
 # What is near is looked up so much farther than was asked for: paths go on from step to step.
-NEAR_M = 4.0
+NEAR_M = 6.0
 
 
 class Near(NamedTuple):
@@ -77,7 +77,7 @@ class Near(NamedTuple):
     within: Box
     edges: list[tuple[float, float, float, float, PlainEdge]]
     parts: NDArray[np.object_]
-    boxes: list[Box]
+    boxes: list[list[float]]
     owners: list[int]
 
     def covers(self, box: Box) -> bool:
@@ -157,6 +157,7 @@ class Prescription:
         self._parts = np.concatenate([zone_parts, field_parts])
         self._owner = np.concatenate([owner, np.full(len(field_parts), FIELD, dtype=np.int64)])
         self._tree = STRtree(self._parts)
+        self._boxes: Floats = shapely.bounds(self._parts)
         shapely.prepare(self._parts)
         self.edges = _edges(self._parts, self._owner)
         self.bounds_m: tuple[float, float, float, float] = (
@@ -229,7 +230,7 @@ class Prescription:
                 within,
                 [(w, s, e, n, edge) for (w, s, e, n), edge in zip(boxes, plain, strict=True)],
                 self._parts[parts][:, None],
-                list(map(tuple, shapely.bounds(self._parts[parts]).tolist())),
+                self._boxes[parts].tolist(),
                 self._owner[parts].tolist(),
             )
         return found

@@ -456,17 +456,6 @@ def _trims(
     return changes
 
 
-def is_in_zone(route: Route, *, longest_s: float, now_s: float, until_s: float) -> bool:
-    """Whether nothing of a route is ordered or held back by `until_s`: its zone goes on.
-
-    `longest_s` is the longest lead of any order.
-    """
-    if len(route) == 1:
-        return True
-    # Of more than one crossing, a stay may be too short, which is counted.
-    return len(route) == 2 and route[1].at_s - longest_s > max(until_s, now_s + STICKY_S)
-
-
 def in_zone(
     rate_l_ha: float | None,
     valve: int,

@@ -97,6 +97,8 @@ class TimedChange:
     restart: bool = True
 
     def __post_init__(self) -> None:
+        if 0.0 <= self.duty <= 1.0 and -math.inf < self.at_s < math.inf and self.valve >= 0:
+            return  # at once: each step makes several
         if not 0.0 <= self.duty <= 1.0:
             raise ValueError(f"duty outside [0, 1]: {self.duty}")
         if not abs(self.at_s) < math.inf:

@@ -261,8 +261,8 @@ def _within(
         if not first < last or not low_m < high_m:
             continue
         # A chord's own ends are its times, to the last bit: the next one goes on there.
-        since_s, until_s = times_s = paths.time_s[chord : chord + 2]
-        speeds_m_s = paths.speed_m_s[valve, chord : chord + 2].tolist()
+        times_s, speeds_m_s = paths.chord_of(valve, chord)
+        since_s, until_s = times_s
         reach = paths.length_m.item(valve, chord)
         if first > 0.0:
             since_s = time_on_chord(times_s, speeds_m_s, first * reach, reach)[0]

@@ -403,9 +403,11 @@ def follow(
     """Return the area until `now_s`, where `plan` was the one in force, `pumped` its pump's."""
     if area is None:
         area = begin(settings)
-    if not (findings or settings.is_pumped) and _stays_so(area, plan, state, now_s):
+    is_as_ordered = not (findings or settings.is_pumped) and _orders_stay(area, plan, now_s)
+    if is_as_ordered and _stays_so(area, plan, state, now_s):
         return area
-    area = _ordered(settings, area, plan, pumped, findings, now_s=now_s)
+    if not is_as_ordered:
+        area = _ordered(settings, area, plan, pumped, findings, now_s=now_s)
     is_at_work = any(area.is_open) or any(area.ordered) or bool(area.flow_edges)
     if not (is_at_work or (plan is not None and plan.opens)):
         return area.come()._replace(poses=()) if area.poses else area
@@ -417,15 +419,9 @@ def follow(
     return _moved(settings, area, pose, now_s)
 
 
-def _stays_so(
-    area: TreatedArea, plan: SprayPlan | None, state: VehicleState | None, now_s: float
-) -> bool:
-    """Return whether nothing has to be noted yet: the usual step, told apart at little cost."""
-    if plan is None or state is None or not now_s < plan.lease_until_s:
-        return False
-    if not area.poses:
-        return not (plan.opens or area.flow_edges or any(area.ordered) or any(area.is_open))
-    if not 0.0 <= now_s - area.poses[0].time_s < STAMP_EVERY_S:
+def _orders_stay(area: TreatedArea, plan: SprayPlan | None, now_s: float) -> bool:
+    """Return whether a plan has kept every valve as it was ordered before."""
+    if plan is None or not now_s < plan.lease_until_s:
         return False
     ordered = area.ordered
     for duty, is_open in zip(plan.duty, ordered, strict=True):
@@ -434,6 +430,19 @@ def _stays_so(
     for change in plan.changes:
         if change.at_s <= now_s and (change.duty > 0.0) is not ordered[change.valve]:
             return False
+    return True
+
+
+def _stays_so(
+    area: TreatedArea, plan: SprayPlan | None, state: VehicleState | None, now_s: float
+) -> bool:
+    """Return whether nothing has to be noted yet: the usual step, told apart at little cost."""
+    if plan is None or state is None:
+        return False
+    if not area.poses:
+        return not (plan.opens or area.flow_edges or any(area.ordered) or any(area.is_open))
+    if not 0.0 <= now_s - area.poses[0].time_s < STAMP_EVERY_S:
+        return False
     # With a wind's offset that moved meanwhile this is a little off, and no more than that.
     last_s, east_m, north_m, _ = area.poses[-1]
     away_m = abs(state.east_m - east_m) + abs(state.north_m - north_m)
