@@ -52,6 +52,8 @@ class Coverage:
     without_rate_m2: float = 0.0
 
 
+# Layouts, what they leave and what is told of a plan are about the same ground.
+@lru_cache(maxsize=8)
 def reachable(ground: BaseGeometry, width_m: float) -> BaseGeometry:
     """Return the ground that a disc of half the width can touch without leaving it."""
     return ground.buffer(-width_m / 2.0).buffer(width_m / 2.0 * (1.0 - 1e-9))
