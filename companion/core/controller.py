@@ -372,8 +372,7 @@ def _orders(
         )
     valves: list[ValveSchedule] = []
     alike: dict[tuple[float | None, float, float, Dosing], ValveSchedule] = {}
-    for valve, route in enumerate(own_routes):
-        own = shares[valve]
+    for valve, (route, own) in enumerate(zip(own_routes, shares, strict=True)):
         of_valve = dosing(valve) if setup.pumping is None else on_off
         # Of several crossings a stay may be too short, which is counted.
         if len(route) == 1 or (len(route) == 2 and route[1].at_s > free_s):
