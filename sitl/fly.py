@@ -163,14 +163,11 @@ def fly_mission(options: FlyOptions, say: Say) -> Flown:
     wall_s = time.perf_counter() - began_s
     say(f"flown {result.simulated_s:.0f} s in {wall_s:.2f} s; evaluating")
     evaluation = evaluate(result.record)
-    perfect = None
-    if task.profile.pump is None and not task.profile.drive_count:
-        perfect = evaluate(_perfect_flight(task, trajectory, options).record)
     return Flown(
         task=task,
         result=result,
         evaluation=evaluation,
-        perfect=perfect,
+        perfect=_perfect(task, trajectory, options),
         trajectory=trajectory,
         zero_rate_ml=zero_rate_ml(result.record, evaluation.off_target_ml),
         trace=tuple(trace),
@@ -418,12 +415,17 @@ def _output(task: Task, options: FlyOptions) -> Literal["gpio", "servo"]:
     return "servo" if task.config.output.kind == "servo" else "gpio"
 
 
-def _perfect_flight(task: Task, trajectory: Trajectory, options: FlyOptions) -> FlightResult:
-    """Fly the same path and the same sprayer with all that is true of them known."""
+def _perfect(task: Task, trajectory: Trajectory, options: FlyOptions) -> Evaluation | None:
+    """Fly the same path and the same sprayer with all that is true of them known.
+
+    None where a motor makes the flow: its steps take time, whatever is known.
+    """
+    if task.profile.pump is not None or task.profile.drive_count:
+        return None
     output_s = WIRE_S + 0.5 * SERVO_FRAME_S if _output(task, options) == "servo" else 0.0
     perfect = replace(_flight_options(task, options), knows=True, meter_rate_hz=0.0)
     profile = true_profile(task.profile, perfect)
-    return fly(
+    result = fly(
         perfect_setup(task.setup, profile, seed=options.seed, output_s=output_s),
         trajectory,
         profile,
@@ -431,6 +433,7 @@ def _perfect_flight(task: Task, trajectory: Trajectory, options: FlyOptions) -> 
         speed_m_s=task.speed_m_s,
         mission=_mission(task),
     )
+    return evaluate(result.record)
 
 
 def _mission(task: Task) -> Route | None:

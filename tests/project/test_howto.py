@@ -171,10 +171,14 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def vrspray(within: Path, *words: str) -> Result:
-    """Run a command in a folder, in this process and not at the low priority of a command."""
+    """Run a command in a folder, in this process and not at the low priority of a command.
+
+    A flight is not compared with one of perfect knowledge: no page has a word of that.
+    """
     with pytest.MonkeyPatch.context() as patch, compiled_here():
         patch.chdir(within)
         patch.setattr("companion.cli.app.give_way", lambda *_: None)
+        patch.setattr("sitl.fly._perfect", lambda *_: None)
         return CliRunner().invoke(app, words)
 
 

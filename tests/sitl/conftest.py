@@ -17,3 +17,11 @@ def two_passes() -> Iterator[None]:
         demo_trajectory.cache_clear()
         yield
     demo_trajectory.cache_clear()
+
+
+@pytest.fixture
+def not_compared() -> Iterator[None]:
+    """Fly no second flight with perfect knowledge: for what is not asked of the comparison."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sitl.fly._perfect", lambda *_: None)
+        yield

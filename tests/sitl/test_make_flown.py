@@ -79,7 +79,7 @@ def metres(degrees: np.ndarray) -> np.ndarray:
     return np.column_stack(back.transform(degrees[:, 0], degrees[:, 1]))
 
 
-def test_weeds_are_hit_and_little_else_is_sprayed(field: Path) -> None:
+def test_weeds_are_hit_and_little_else_is_sprayed(field: Path, not_compared: None) -> None:
     weeds = np.random.default_rng(2).uniform([6.0, 3.0], [84.0, 21.0], (12, 2))
     longitude, latitude = TO_DEGREES.transform(weeds[:, 0], weeds[:, 1])
     rows = [f"{lat:.9f},{lon:.9f}" for lat, lon in zip(latitude, longitude, strict=True)]
@@ -105,7 +105,7 @@ def test_weeds_are_hit_and_little_else_is_sprayed(field: Path) -> None:
         assert volume_ml[near].sum() * 10.0 > 0.75 * 20.0
 
 
-def test_plots_get_what_the_evaluation_says(field: Path) -> None:
+def test_plots_get_what_the_evaluation_says(field: Path, not_compared: None) -> None:
     made: dict[str, Any] = json.loads(
         vrspray(
             "make", "trial", "--config", field / "config.toml", "--rates", "15,25", "--rest", "20",

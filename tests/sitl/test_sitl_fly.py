@@ -88,7 +88,7 @@ def test_out_keeps_truth_result_picture_and_a_journal_that_replays(
     assert (out / "flight.png").stat().st_size > 10_000
 
 
-def test_the_same_seed_gives_the_same_flight(options: FlyOptions) -> None:
+def test_the_same_seed_gives_the_same_flight(options: FlyOptions, not_compared: None) -> None:
     first, second = (fly_mission(options, silent).result.record for _ in range(2))
     assert np.array_equal(first.volume_ml, second.volume_ml)
 
@@ -268,7 +268,7 @@ def scenario(folder: Path, kind: str) -> Path:
     ],
 )
 def test_a_fault_of_the_scenario_closes_the_valves(
-    options: FlyOptions, tmp_path: Path, kind: str, inhibit: str
+    options: FlyOptions, tmp_path: Path, kind: str, inhibit: str, not_compared: None
 ) -> None:
     flown = fly_mission(replace(options, scenario=scenario(tmp_path, kind)), silent)
     assert inhibit in flown.result.inhibits
