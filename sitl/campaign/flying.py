@@ -32,10 +32,18 @@ from sitl.anyang import (
     scaled,
 )
 from sitl.campaign.settings import P1S_FIELD, Settings, Value, overrides_of, with_plant
-from sitl.disturbances import RATE_HZ, Disturbance, displaced, drifted, shortened
+from sitl.conditions import (
+    RATE_HZ,
+    Condition,
+    Disturbance,
+    condition_of,
+    displaced,
+    drifted,
+    laid_out,
+    shortened,
+)
 from sitl.flight import FlightOptions, FlightResult, fly, true_profile
 from sitl.fly import DEFAULT_ACCELERATION_M_S2, FlyOptions, Task, prepare, with_faults
-from sitl.hard_fields import Condition, condition_of, laid_out
 from sitl.knowledge import perfect_setup, with_sprayer
 from sitl.motor_parts import ranges_us
 from sitl.outputs import SERVO_FRAME_S, WIRE_S

@@ -14,8 +14,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, Literal, get_args
 
 from companion.errors import ConfigError
-from sitl.disturbances import BORDER, INSIDE
-from sitl.hard_fields import CONDITIONS
+from sitl.conditions import BORDER, CONDITIONS, INSIDE
 from sitl.profile import FlowLaw, Meter, PlantProfile, Pulsing, Pump
 from sitl.supply import Supply
 from sitl.vehicle import Corners

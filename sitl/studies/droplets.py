@@ -28,7 +28,7 @@ from companion.cli.answer import AsJson, answer
 from companion.core.options.drift import Drift, fall_s
 from companion.core.types import Input, WindReport
 from sitl.anyang import demo_lags, demo_setup, demo_trajectory
-from sitl.disturbances import on_ground
+from sitl.conditions import on_ground
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sitl.hard_fields import condition_of
+from sitl.conditions import condition_of
 from tests.bench.flights import FIELD, NOMINAL, PAPER_METHODS, Flown
 from tests.bench.sprayers import PLANT
 

@@ -23,8 +23,8 @@ from sitl.campaign.dataset import open_dataset, read_columns
 from sitl.campaign.design import Campaign, read_campaign
 from sitl.campaign.flying import figures_of
 from sitl.campaign.running import Done, Tally, Workers, fly_missing, pool_of
+from sitl.conditions import CONDITIONS, condition_of, laid_out
 from sitl.flight import FlightOptions, fly
-from sitl.hard_fields import CONDITIONS, condition_of, laid_out
 from sitl.profile import load_profile
 from tests.bench.sprayers import PLANT, Output, known_setup, sprayer_setup
 

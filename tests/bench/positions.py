@@ -18,8 +18,8 @@ from pathlib import Path
 from statistics import fmean
 
 from analysis.evaluation import Evaluation, evaluate
+from sitl.conditions import condition_of
 from sitl.flight import FlightOptions, fly
-from sitl.hard_fields import condition_of
 from sitl.profile import load_profile
 from sitl.workers import do_all
 from tests.bench.flights import FIELD, Task, place

@@ -15,8 +15,8 @@ from analysis.evaluation import evaluate
 from companion.core.nozzle import flow_for_rate
 from sitl.anyang import demo_trajectory
 from sitl.campaign.design import read_campaign
+from sitl.conditions import CONDITIONS, condition_of, laid_out
 from sitl.flight import fly
-from sitl.hard_fields import CONDITIONS, condition_of, laid_out
 from sitl.profile import load_profile
 from tests.bench import __main__ as bench
 from tests.bench import parts

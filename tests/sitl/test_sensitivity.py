@@ -14,7 +14,7 @@ from companion.core.types import Input, Telemetry
 from companion.errors import ConfigError
 from sitl.anyang import anyang_lag, demo_setup
 from sitl.campaign.design import read_campaign
-from sitl.disturbances import BORDER, INSIDE, Disturbance, displaced, on_ground, shortened
+from sitl.conditions import BORDER, INSIDE, Disturbance, displaced, on_ground, shortened
 from sitl.studies.sensitivity import (
     Cost,
     Figures,
