@@ -296,8 +296,8 @@ def _steps(strip: Strip, record: FlightRecord) -> list[Step]:
             verdict = Verdict.UNKNOWN
         elif _is_within(step.change.time_s, spared):
             verdict = Verdict.BORDER
-        lag_m = step.lag_distance_m if verdict is step.verdict else None
-        found.append(replace(step, verdict=verdict, lag_distance_m=lag_m))
+        is_same = verdict is step.verdict
+        found.append(step if is_same else replace(step, verdict=verdict, lag_distance_m=None))
     return found
 
 

@@ -186,6 +186,8 @@ RANGE_SLACK = 0.02
 def as_wished(flight: AppliedFlight, marks: Marks, off_by: float) -> Bools:
     """Return where it got the percentage that the operator asked for, give or take `off_by`."""
     lag, setup = flight.setup.lag, marks.setup
+    if not rate_wishes(flight):
+        return np.zeros(len(marks.time_s), dtype=np.bool_)
     percent = percent_at(flight, marks.time_s - lag.output_s - lag.up_s)
     wished: Floats = marks.asked_ml_m * percent / 100.0
     if setup.rate_max_l_ha is not None:
@@ -238,7 +240,9 @@ def in_change(marks: Marks, steps: Sequence[Step]) -> Bools:
         until_m = change.distance_m + reach_m
         if step.verdict is Verdict.MISSED and change.time_s in starts_s:
             until_m = ends_m[change.time_s]
-        found |= (marks.distance_m >= change.distance_m - reach_m) & (marks.distance_m <= until_m)
+        # The marks are in order of distance.
+        first = marks.distance_m.searchsorted(change.distance_m - reach_m)
+        found[first : marks.distance_m.searchsorted(until_m, "right")] = True
     return found
 
 

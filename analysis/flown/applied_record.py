@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -111,16 +112,17 @@ def _meta(flight: AppliedFlight) -> FlightMeta:
         speed_m_s=float(np.median(every)),
         method=flight.setup.method.value,
         fidelity="averaged",
-        output=_output(flight),
+        output=_output(flight.meta.get("config_toml", "")),
         seed=0,
     )
     return replace(meta, training=flight.training)
 
 
-def _output(flight: AppliedFlight) -> str:
-    """Return the kind of output that the configuration of the flight named."""
+@lru_cache(maxsize=8)
+def _output(config_toml: str) -> str:
+    """Return the kind of output that a configuration names."""
     try:
-        table = tomllib.loads(flight.meta.get("config_toml", "")).get("output", {})
+        table = tomllib.loads(config_toml).get("output", {})
     except tomllib.TOMLDecodeError:
         return "unknown"
     return str(table.get("kind", "unknown"))

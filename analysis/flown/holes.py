@@ -176,13 +176,13 @@ def _order_s(changes: ValveChanges) -> Floats:
     return np.where(np.isfinite(changes.actual_s), changes.actual_s, changes.planned_s)
 
 
-def _open_counts(changes: ValveChanges) -> list[int]:
+def _open_counts(changes: ValveChanges) -> Ints:
     """Return how many valves are open after each change."""
-    still_open: set[int] = set()
-    counts = []
-    for valve, duty in zip(changes.valve.tolist(), changes.duty.tolist(), strict=True):
-        (still_open.add if duty > 0.0 else still_open.discard)(valve)
-        counts.append(len(still_open))
+    opens = np.zeros(len(changes.duty), dtype=np.int64)
+    for valve in np.unique(changes.valve).tolist():
+        its = np.flatnonzero(changes.valve == valve)
+        opens[its] = np.diff((changes.duty[its] > 0.0).astype(np.int64), prepend=0)
+    counts: Ints = np.cumsum(opens)
     return counts
 
 

@@ -238,10 +238,10 @@ class _Reader(Reader):
         content, at = self._content, self._at
         if count > len(content) - at:
             raise ValueError("a block is cut off")
-        found = np.frombuffer(content, dtype=np.uint8, count=count, offset=at)
-        if not count or found.max() <= PLENTY:
+        # A byte that goes on in the next one is none of ASCII's.
+        if content[at : at + count].isascii():
             self._at += count
-            return found.astype(np.int64)
+            return np.frombuffer(content, dtype=np.uint8, count=count, offset=at).astype(np.int64)
         reach = min(_BYTES_OF_INT64 * count, len(content) - at)
         raw = np.frombuffer(content, dtype=np.uint8, count=reach, offset=at)
         ends = np.flatnonzero(raw <= PLENTY)[:count]
