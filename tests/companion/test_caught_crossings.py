@@ -147,10 +147,14 @@ def test_a_boom_along_its_own_motion_is_closed_where_a_border_is_near() -> None:
     assert routes_of(field, sideways, one_valve(6.0))[0][0][1] is None
 
 
+@pytest.mark.parametrize("yaw_rate_deg_s", [0.0, 3.5])  # a straight pass; the slowest of turns
 @pytest.mark.parametrize(("north_m", "rate"), [(6.45, None), (6.35, 20.0)])
-def test_a_strip_beside_the_border_keeps_the_buffer(north_m: float, rate: float | None) -> None:
+def test_a_strip_beside_the_border_keeps_the_buffer(
+    north_m: float, rate: float | None, yaw_rate_deg_s: float
+) -> None:
     zone = Zone(name="a", polygon=shapely.box(0, 0, 48, 7), rate_l_ha=20.0)
-    (found,) = routes_of(Prescription([zone]), flying(10.0, 20.0, north_m), one_valve())
+    state = flying(10.0, 20.0, north_m, yaw_rate_deg_s=yaw_rate_deg_s)
+    (found,) = routes_of(Prescription([zone]), state, one_valve())
     assert [value for _, value in found] == [rate]
 
 
