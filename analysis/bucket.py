@@ -1,7 +1,7 @@
 """From a bucket test to the flow curve of a nozzle set.
 
 What was caught at each duty is averaged; where the scatter of repeated catches justifies it, a
-smoother curve stands for the means (`bucket_fit`). Where flow still does not rise with duty,
+smoother curve stands for the means. Where flow still does not rise with duty,
 neighbours are pooled (isotonic regression), so that the curve is one that the controller takes.
 The same holds for a pump on a motor's output, with the width of its pulse in place of the duty.
 """

@@ -35,7 +35,7 @@ def replay_journal(
     flew, and the sprayer stays what the recorded set-up says of it.
 
     Exit 0: all the same; 1: a decision or the treated ground differs, or the file is damaged or of
-    another version; 2: it is no journal, or an option cannot be used.
+    another version; 2: it is not a journal, or an option cannot be used.
     """
     from analysis.replay import replay as run
 

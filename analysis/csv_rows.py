@@ -137,4 +137,4 @@ def _text(path: Path) -> str:
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise TableError(f"{path}: this is no text in UTF-8; save it as CSV in UTF-8") from None
+        raise TableError(f"{path}: this is not text in UTF-8; save it as CSV in UTF-8") from None

@@ -7,7 +7,7 @@ flight, + beyond it:
 
 A time error grows with the speed, a body offset is the same in all directions of flight, a shift
 of the map against the ground changes its sign with the direction. Least squares on boundaries
-flown to and fro at two speeds separate them; `marks_design` says what cannot be told apart.
+flown to and fro at two speeds separate them; `least_singular` says what cannot be told apart.
 """
 
 from __future__ import annotations

@@ -149,7 +149,7 @@ def read_trial(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         raise TrialError(f"{path}: cannot be read ({error.strerror or error})") from None
     except (ValueError, KeyError, TypeError, RecursionError):
         raise TrialError(
-            f"{path}: this is no trial; give the NAME.trial.geojson of `vrspray make trial`"
+            f"{path}: this is not a trial; give the NAME.trial.geojson of `vrspray make trial`"
         ) from None
     if not inner:
         raise TrialError(f"{path}: has no plots; make the trial again")
@@ -274,7 +274,7 @@ def _csv_rows(path: Path, value: str) -> list[tuple[float, float, float]]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
-        raise TrialError(f"{path}: this is no text in UTF-8; save it as CSV in UTF-8") from None
+        raise TrialError(f"{path}: this is not text in UTF-8; save it as CSV in UTF-8") from None
     first = text.partition("\n")[0]
     reader = csv.reader(StringIO(text), delimiter=max(",;\t", key=first.count))
     names = [name.strip().casefold() for name in next(reader, [])]

@@ -10,7 +10,7 @@
      +-- JournalError     a journal cannot be opened, read or written
           +-- UnreadableError  a journal, of which what is asked for cannot be read
                +-- NoMapError  its map is damaged: the rest can be read
-               +-- OtherVersionError  its version is not known (journal/versions.py)
+               +-- OtherVersionError  its version is not known (journal/reader.py)
 
 A wrong argument inside our own code is a `ValueError`: a bug, not a condition.
 """

@@ -30,7 +30,7 @@ from missions.strips import (
 NARROW_PERCENT = 2.0
 # What is twice as broad is no crumb.
 BROAD_M = 0.25
-# Less than this is no ground but the last digits of large numbers.
+# Less than this is not a ground but the last digits of large numbers.
 NOISE_M2 = 1e-6
 # Of the cells in which rates are looked at.
 CELL_M, CELLS_MAX = 0.5, 200_000

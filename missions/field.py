@@ -348,9 +348,9 @@ class WindBuffer:
         if not 0.0 <= self.speed_m_s <= 100.0:
             raise ValueError(f"a wind of {self.speed_m_s} m/s does not exist")
         if not -360.0 <= self.from_deg <= 360.0:
-            raise ValueError(f"{self.from_deg} is no direction of the wind")
+            raise ValueError(f"{self.from_deg} is not a direction of the wind")
         if not 0.0 <= self.m_per_m_s <= 1000.0:
-            raise ValueError(f"{self.m_per_m_s} m for each m/s of wind is no buffer")
+            raise ValueError(f"{self.m_per_m_s} m for each m/s of wind is not a buffer")
 
     @property
     def extra_m(self) -> float:

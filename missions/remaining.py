@@ -69,7 +69,7 @@ def read_lines(path: Path, frame: LocalFrame) -> list[tuple[int, Floats]]:
         rows = [(sortie, _local(points, frame)) for sortie, _, points in sorted(found)]
     except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
         raise PlanError(
-            f"{path}: this is no plan to go on with ({error}); take the .geojson of vrspray plan"
+            f"{path}: this is not a plan to go on with ({error}); take the .geojson of vrspray plan"
         ) from error
     if not rows or not np.isfinite(np.array([row for _, row in rows])).all():
         raise PlanError(f"{path}: there is no spray line in it; take the .geojson of vrspray plan")

@@ -237,7 +237,7 @@ SQUARE_DEG = 90.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Way:
+class _Stretch:
     """A way between two waypoints; `legs` are (leg, metres) that it is of.
 
     One that leads `upright_m` up, or down, has both above each other.
@@ -283,7 +283,7 @@ def _timed(sortie: Sortie, settings: Settings) -> Sortie:
     return replace(sortie, legs=tuple(legs))
 
 
-def _course(way: _Way, settings: Settings) -> Course:
+def _course(way: _Stretch, settings: Settings) -> Course:
     """Return how fast a way is flown, and how that speed is reached."""
     if not way.upright_m:
         return settings.motion.at(way.speed_m_s)
@@ -295,13 +295,13 @@ def _course(way: _Way, settings: Settings) -> Course:
     )
 
 
-def _bend_deg(before: _Way, after: _Way) -> float:
+def _bend_deg(before: _Stretch, after: _Stretch) -> float:
     if before.upright_m or after.upright_m:
         return SQUARE_DEG
     return (after.course_deg - before.course_deg + 180.0) % 360.0 - 180.0
 
 
-def _ways(sortie: Sortie, lines_m: float) -> list[_Way]:
+def _ways(sortie: Sortie, lines_m: float) -> list[_Stretch]:
     """Return the straight ways of a sortie, one after the other, climbs and descents among them.
 
     What a ferry takes to climb and descend, at its two ends, is its own.
@@ -314,7 +314,7 @@ def _ways(sortie: Sortie, lines_m: float) -> list[_Way]:
         if rise_m:
             higher = number if rise_m > 0.0 else number - 1
             found.append(
-                _Way(
+                _Stretch(
                     start=here, end=here, speed_m_s=leg.speed_m_s,
                     legs=((higher, abs(rise_m)),), upright_m=rise_m,
                 )
@@ -332,7 +332,7 @@ def _ways(sortie: Sortie, lines_m: float) -> list[_Way]:
             length_m = math.dist(here, place)
             if length_m > TOUCH_M:
                 found.append(
-                    _Way(
+                    _Stretch(
                         start=here, end=place, speed_m_s=leg.speed_m_s, legs=((number, length_m),),
                     )
                 )  # fmt: skip
@@ -349,7 +349,7 @@ def _is_no_way(sortie: Sortie, number: int) -> bool:
     return [other.kind for other in around] == ["spray", "spray"]
 
 
-def _ways_without_runs(ways: list[_Way], sprays: Sequence[bool]) -> list[_Way]:
+def _ways_without_runs(ways: list[_Stretch], sprays: Sequence[bool]) -> list[_Stretch]:
     """Return the ways between waypoints: those that lead straight on are one.
 
     `sprays` says of which legs are lines.

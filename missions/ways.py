@@ -185,7 +185,7 @@ def build_ways(field: Field, depots: Floats, inside: FreeSpace | None = None) ->
     """
     for number, (east_m, north_m) in enumerate(depots.tolist(), start=1):
         if not (math.isfinite(east_m) and math.isfinite(north_m)):
-            raise PlanError(f"depot {number} is no place near the field (mission.depots)")
+            raise PlanError(f"depot {number} is not a place near the field (mission.depots)")
         far_m = float(field.outline.distance(Point(east_m, north_m)))
         if not far_m <= DEPOT_FAR_M:
             raise PlanError(

@@ -35,7 +35,7 @@ PICTURES = ("map.png", "lags.png", "flow.png")
 # The report of the journal's flight; a folder.
 FLIGHT_REPORT = "flight-report"
 FILES = ("demo.json", "report.html", JOURNAL, *PICTURES, FLIGHT_REPORT)
-# The table where the output is no terminal.
+# The table where the output is not a terminal.
 WIDTH = 110
 # From here on there is room between the columns.
 WIDE = 96

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 # A servo output repeats its pulse at 50 Hz: an order waits for the next frame.
 SERVO_FRAME_S = 0.020
-# Narrower than this is no valid servo pulse. After this long without one the board closes.
+# Narrower than this is not a valid servo pulse. After this long without one the board closes.
 PULSE_MIN_US = 900.0
 PULSE_ABSENT_S = 0.100
 # With the alive check an open valve closes when its width has not moved for this long.

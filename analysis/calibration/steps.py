@@ -83,7 +83,7 @@ def record_of(items: Iterable[Input | Decision], setup: Setup) -> FlowRecord:
 
 
 def _is_newer(report: FlowReport, times_s: list[float]) -> bool:
-    """Return whether a reading can be used: one that repeats or that is no number cannot."""
+    """Return whether a reading can be used: one that repeats or that is not a number cannot."""
     if not math.isfinite(report.volume_ml):
         return False
     return not times_s or report.received_s > times_s[-1]

@@ -232,7 +232,7 @@ def _at(series: Series | None, time_s: Floats) -> Floats | None:
 # Corners of the edges lie so far apart at most; what is straighter than a centimetre loses them.
 _CORNER_M = 0.5
 _STRAIGHT_M = 0.01
-# What is no area at all is given this much, so that it can be drawn.
+# What is not an area at all is given this much, so that it can be drawn.
 _HAIR_M = 0.001
 
 

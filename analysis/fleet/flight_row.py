@@ -50,7 +50,7 @@ _M2_PER_HA = 10_000.0
 _PIECE_BYTES = 1 << 20
 _FAULT = "fault-"
 # What a file that is a stranger's says, and one of ours that lost its beginning as well.
-_NO_JOURNAL = "is no journal"
+_NO_JOURNAL = "is not a journal"
 _SQLITE = b"SQLite format 3\0"
 
 
@@ -448,7 +448,7 @@ def _extent(journal: OpenJournal) -> tuple[float | None, float | None, int]:
 
 
 def _started(meta: Mapping[str, str], began_s: float | None) -> datetime | None:
-    """Return the start by the best clock that the flight had; None where it is no time."""
+    """Return the start by the best clock that the flight had; None where it is not a time."""
     offset_s = float(meta["utc_offset_s"])
     at_s = (float(meta["started_s"]) if began_s is None else began_s) + offset_s
     if not (math.isfinite(at_s) and 0.0 <= at_s <= OFFSET_S_MAX):

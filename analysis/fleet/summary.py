@@ -155,7 +155,7 @@ class Chosen(NamedTuple):
         for option, month, sign in (("--from", self.since, ">="), ("--until", self.until, "<=")):
             if month is not None:
                 if not _MONTH.fullmatch(month):
-                    raise ConfigError(f"{option} {month}: is no month; write it as 2026-05")
+                    raise ConfigError(f"{option} {month}: is not a month; write it as 2026-05")
                 parts.append(f"month {sign} '{month}' AND month != 'unknown'")
         unknown = [kind for kind in self.kinds if kind not in KINDS]
         if unknown:

@@ -41,7 +41,7 @@ from companion.journal.read_only import (
 from companion.journal.reader import missing_tables, readable_rows, tolerate_damage
 from companion.journal.writer import LITRES_KEY, SET_META, applied_l
 
-# Without a row of any of these a file is no journal, or nothing of one.
+# Without a row of any of these a file is not a journal, or nothing of one.
 _OF_A_FLIGHT = ("meta", "applied", "blocks", "valve_changes")
 _TELL_VERSION = "INSERT OR IGNORE INTO meta (key, value) VALUES ('journal_version', ?)"
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")

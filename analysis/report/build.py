@@ -30,7 +30,7 @@ from markupsafe import Markup
 from analysis.assess.assessment import Assessment, Figures, assess, figures_of
 from analysis.flown.applied_record import EvaluationError
 from analysis.flown.read_applied import read_applied
-from analysis.report.contents import contents_of
+from analysis.report.contents import contents_of, reasons_in_words
 from analysis.report.legal import LegalRecord, legal_record
 from analysis.report.legal_fields import Told, facts_of, told_with
 from analysis.report.treated import Clock, Treated, clock_of, duration_text, treated_of
@@ -74,7 +74,7 @@ def build_report(journal: Path, options: ReportOptions, *, say: Say = lambda _: 
     """Return the report of one journal; nothing is written.
 
     Raises:
-        JournalError: where the file is no journal, or one that cannot be read.
+        JournalError: where the file is not a journal, or one that cannot be read.
         ConfigError: where an entry of the record or the time zone is none.
     """
     say(f"reading {journal.name}")
@@ -307,6 +307,7 @@ FILTERS: dict[str, Callable[..., str]] = {
     "moment": _moment,
     "span": _span,
     "duration": duration_text,
+    "in_words": reasons_in_words,
 }
 
 

@@ -382,7 +382,7 @@ def dpi_of(info: dict[Any, Any]) -> tuple[float | None, str]:
     >>> dpi_of({"dpi": (600.0, 600.0)})
     (600.0, '')
     >>> dpi_of({"dpi": (72, 72)})
-    (None, 'the file says 72 dpi, which is no resolution of a scan: not used')
+    (None, 'the file says 72 dpi, which is not a resolution of a scan: not used')
     """
     stated = info.get("dpi")
     if stated is None:
@@ -394,7 +394,7 @@ def dpi_of(info: dict[Any, Any]) -> tuple[float | None, str]:
     if not abs(across - down) <= 0.01 * abs(across):
         return None, f"the file says {across:g} x {down:g} dpi, which differ: not used"
     if not LEAST_DPI <= across <= MOST_DPI:
-        return None, f"the file says {across:g} dpi, which is no resolution of a scan: not used"
+        return None, f"the file says {across:g} dpi, which is not a resolution of a scan: not used"
     # PNG keeps whole pixels a metre: 600 dpi comes back as 599.9988.
     whole = round(across)
     return float(whole) if abs(across - whole) < 0.02 else across, ""

@@ -11,14 +11,15 @@ import errno
 import json
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer._click.exceptions import NoArgsIsHelpError
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperArgument, TyperCommand, TyperGroup, TyperOption
 
 from companion.cli.beside import give_way
 from companion.commands import Command, Haste, all_registered, command_named, load, registered
@@ -138,6 +139,12 @@ def load_command(name: str, command: Command) -> ClickCommand:
 
 def _in_our_style(command: ClickCommand) -> ClickCommand:
     """Return a command whose help looks as that of all others, and that shows it when alone."""
+    for parameter in command.params:
+        if isinstance(parameter, TyperArgument | TyperOption):
+            parameter.metavar = parameter.metavar and parameter.metavar.removesuffix(
+                "..."
+            )  # Typer adds them
+            setattr(parameter, "display_type", partial(_in_plain_words, parameter.display_type))  # noqa: B010
     if isinstance(command, TyperCommand | TyperGroup):
         command.rich_markup_mode = None
     if isinstance(command, TyperGroup):
@@ -145,6 +152,15 @@ def _in_our_style(command: ClickCommand) -> ClickCommand:
         for each in command.commands.values():
             _in_our_style(each)
     return command
+
+
+# What Python calls them is no help.
+_TYPES = {"float": "number", "int": "whole number", "str": "text", "Path": "path"}
+
+
+def _in_plain_words(told: Callable[[Context], str], ctx: Context) -> str:
+    label = told(ctx).strip("<>").removeprefix("list[").removesuffix("]").removesuffix(" range")
+    return f"<{','.join(_TYPES.get(each, each) for each in label.split(','))}>"
 
 
 app = typer.Typer(

@@ -53,7 +53,9 @@ def terminal() -> int:
     except (OSError, ValueError, AttributeError) as error:
         raise ClickError("doctor --click: stdin is closed; call it from a terminal") from error
     if not os.isatty(descriptor):
-        raise ClickError("doctor --click: stdin is no terminal, and nobody else can hear a valve")
+        raise ClickError(
+            "doctor --click: stdin is not a terminal, and nobody else can hear a valve"
+        )
     return descriptor
 
 

@@ -362,14 +362,14 @@ async def try_script(
     link: VehicleLink, options: ServoOptions, *, wait_s: float, setup: GroundSetup
 ) -> ScriptTrial:
     """Return how soon the script closes the first valve's output; it is ordered closed after."""
-    ear = _Ear(options)
-    link.follow_outputs(ear)
+    listener = _OutputListener(options)
+    link.follow_outputs(listener)
     wake = asyncio.Event()
     try:
         await link.open(wake.set)
     except LinkError as error:
         return ScriptTrial(problem=str(error))
-    trial = _Trial(link, ear, options, setup, wake)
+    trial = _Trial(link, listener, options, setup, wake)
     try:
         return await trial.run(wait_s)
     finally:
@@ -377,7 +377,7 @@ async def try_script(
         await link.close()
 
 
-class _Ear:
+class _OutputListener:
     """Hears what the outputs read; asks for no parameters."""
 
     def __init__(self, options: ServoOptions) -> None:
@@ -409,12 +409,12 @@ class _Trial:
     def __init__(
         self,
         link: VehicleLink,
-        ear: _Ear,
+        listener: _OutputListener,
         options: ServoOptions,
         setup: GroundSetup,
         wake: asyncio.Event,
     ) -> None:
-        self._link, self._ear, self._options, self._setup = link, ear, options, setup
+        self._link, self._listener, self._options, self._setup = link, listener, options, setup
         self._wake = wake
         self._state = GroundState()
         self._sequence = 0
@@ -425,9 +425,9 @@ class _Trial:
     async def run(self, wait_s: float) -> ScriptTrial:
         """Wait for the vehicle, move the output with a sign of life, then fall silent."""
         await self._steps(
-            lambda now_s: self._ear.is_px4 is True or not self._reasons(now_s), for_s=wait_s
+            lambda now_s: self._listener.is_px4 is True or not self._reasons(now_s), for_s=wait_s
         )
-        if self._ear.is_px4:
+        if self._listener.is_px4:
             return ScriptTrial(is_px4=True)
         reasons = self._reasons(time.monotonic())
         if reasons:
@@ -442,7 +442,7 @@ class _Trial:
             live_s = time.monotonic()
             if self._reasons(live_s):
                 return ScriptTrial(reasons=self._reasons(live_s))
-        if not self._is_moved(self._ear.reports[-1][1] if self._ear.reports else 0):
+        if not self._is_moved(self._listener.reports[-1][1] if self._listener.reports else 0):
             return ScriptTrial(problem=self._unmoved())
         await self._steps(lambda _now_s: False, for_s=_SILENT_S)
         return self._result(live_s)
@@ -455,7 +455,9 @@ class _Trial:
     # ----------------------------------------------------------------------------- inside
 
     def _result(self, live_s: float) -> ScriptTrial:
-        after = [(at_s - live_s, pulse_us) for at_s, pulse_us in self._ear.reports if at_s > live_s]
+        after = [
+            (at_s - live_s, pulse_us) for at_s, pulse_us in self._listener.reports if at_s > live_s
+        ]
         closed = [since_s for since_s, pulse_us in after if self._is_closed(pulse_us)]
         moved = [since_s for since_s, pulse_us in after if not self._is_closed(pulse_us)]
         if not after:
@@ -464,10 +466,10 @@ class _Trial:
         return ScriptTrial(open_s=max(moved, default=0.0), closed_s=closed_s)
 
     def _unmoved(self) -> str:
-        if not self._ear.reports:
+        if not self._listener.reports:
             return "nothing tells what the output does (SERVO_OUTPUT_RAW)"
         return (
-            f"output {self._options.outputs[0]} reads {self._ear.reports[-1][1]} us, "
+            f"output {self._options.outputs[0]} reads {self._listener.reports[-1][1]} us, "
             f"ordered {self._moved_us}"
         )
 

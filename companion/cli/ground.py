@@ -62,7 +62,7 @@ _SIGNALS = {
 }
 # So often a wait for a line looks for signals: Ctrl-C is answered at once to a person.
 _SIGNALS_EVERY_S = 0.1
-# A line that is longer is no line.
+# A line that is longer is not a line.
 _LINE_MAX = 4096
 _INPUT_FLAGS, _LOCAL_FLAGS, _CHARACTERS = 0, 3, 6
 
@@ -256,7 +256,7 @@ def listening(is_lines: bool) -> int:
         raise GroundOptionError("ground: stdin is closed; nobody could hold the key") from error
     if not is_lines and not os.isatty(descriptor):
         raise GroundOptionError(
-            "ground: stdin is no terminal, so that no key can be held; give --hold-lines and a "
+            "ground: stdin is not a terminal, so that no key can be held; give --hold-lines and a "
             "line at least every 0.5 s"
         )
     return descriptor

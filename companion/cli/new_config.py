@@ -17,6 +17,7 @@ from typing import Any, Literal
 from companion.atomic_write import write_atomically
 from companion.cli.answer import problem_line, problem_object
 from companion.cli.app import find_command, load_command
+from companion.commands import registered
 from companion.config import Config, load
 from companion.errors import ConfigError, MapError, Problem, VrsprayError
 
@@ -427,7 +428,8 @@ def read_profile(name: str) -> str:
 
 def _folders() -> list[Path]:
     """Return where profiles are: in the wheel beside the simulation, or in the source tree."""
-    found = find_spec("sitl")
+    told = registered().get("sitl")
+    found = None if told is None else find_spec(told.module.partition(".")[0])
     packages = [] if found is None else list(found.submodule_search_locations or ())
     places = [Path(each) / "examples" for each in packages]
     places += [Path(each).parent / "examples" for each in packages]

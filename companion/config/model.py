@@ -33,7 +33,7 @@ FIXES = {
 }
 # Ten times what an RTK receiver says of itself when all is well.
 RTK_ACCURACY_MAX_M = 0.3
-# A plan's lines overlap where the field is no whole number of swaths wide: closed where all of a
+# A plan's lines overlap where the field is not a whole number of swaths wide: closed where all of a
 # strip is treated, a valve leaves no bare ground there.
 ON_LINES_PERCENT = 100.0
 

@@ -232,7 +232,7 @@ class OutputTable(Table):
 
 
 class GpioTable(Table):
-    """Lines of this computer, for `output.kind = "gpio"`; see gpio.md."""
+    """Lines of this computer, for `output.kind = "gpio"`; see howto/wire-gpio.md."""
 
     driver: Literal["lines", "spi595"] = Field(
         default="lines", description="spi595: a chain of shift registers; channels are its outputs"
@@ -267,16 +267,18 @@ Speeds = Annotated[
     Field(strict=False, min_length=2, max_length=1000),
 ]
 Diameter = Annotated[FiniteFloat, Field(ge=5, le=5000)]
-Way = Literal["autopilot", "pwm"]
+MotorOutput = Literal["autopilot", "pwm"]
 
 
 class PumpTable(Table):
-    """A pump on an ESC; see pump.md."""
+    """A pump on an ESC; see howto/pump-instead-of-valves.md."""
 
     control: Literal["modulates", "constant"] = Field(
         description="modulates: its speed makes the flow; constant: it supplies PWM valves"
     )
-    output: Way = Field(default="autopilot", description="pwm: hardware PWM of this computer")
+    output: MotorOutput = Field(
+        default="autopilot", description="pwm: hardware PWM of this computer"
+    )
     channel: int = Field(ge=0, le=32, description="servo output or actuator, or the PWM's number")
     chip: int = Field(default=0, ge=0, le=99, description="pwm only: number of the pwmchip")
     stop_us: Pulse = Field(default=1000, description="servo pulse that stops it")
@@ -312,7 +314,9 @@ class AtomiserTable(Table):
     """One rotary atomiser."""
 
     name: Text = Field(description="for messages")
-    output: Way = Field(default="autopilot", description="pwm: hardware PWM of this computer")
+    output: MotorOutput = Field(
+        default="autopilot", description="pwm: hardware PWM of this computer"
+    )
     channel: int = Field(ge=0, le=32, description="servo output or actuator, or the PWM's number")
     chip: int = Field(default=0, ge=0, le=99, description="pwm only: number of the pwmchip")
     stop_us: Pulse = Field(default=1000, description="servo pulse that stops it")
@@ -344,7 +348,8 @@ class FlowMeterTable(Table):
     """The flow meter before all valves."""
 
     source: Literal["none", "gpio", "autopilot"] = Field(
-        default="none", description="gpio: pulses on a line of this computer; see sensors.md"
+        default="none",
+        description="gpio: pulses on a line of this computer (howto/wire-flow-meter.md)",
     )
     pulses_per_l: float | None = Field(
         default=None, gt=0, le=1_000_000, description="measured with a bucket; gpio only"

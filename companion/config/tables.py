@@ -491,7 +491,7 @@ WindFrom = Annotated[FiniteFloat, Field(ge=0.0, le=360.0)]
 
 
 class FlowTrimTable(Table):
-    """Slow correction by a flow meter; see flow-trim.md."""
+    """Slow correction by a flow meter; see howto/correct-flow-drift.md."""
 
     enabled: bool = Field(
         default=False, description="true: flows are divided by metered over expected flow"
@@ -527,7 +527,7 @@ class ValveTrackingTable(Table):
 
 
 class DriftTable(Table):
-    """Where droplets land beside their nozzle; see drift.md."""
+    """Where droplets land beside their nozzle; see howto/wind-and-drift.md."""
 
     enabled: bool = Field(
         default=False, description="true: the map is read where the droplets are expected to land"

@@ -44,7 +44,7 @@ class Valve:
         if not 0.0 < self.width_m < 1000.0:
             raise ValueError(f"width of valve {self.name} must be positive, got {self.width_m}")
         if not (abs(self.right_m) < 1000.0 and abs(self.forward_m) < 1000.0):
-            raise ValueError(f"offset of valve {self.name} is no length")
+            raise ValueError(f"offset of valve {self.name} is not a length")
         if not 0.5 <= self.flow_factor <= 2.0:
             raise ValueError(f"flow_factor of valve {self.name} must lie in [0.5, 2]")
         if not all(abs(lag_s) <= 0.5 for lag_s in self.lags_s):

@@ -79,7 +79,7 @@ def leg_of(report: LegReport, frame: LocalFrame, braking_m_s2: float | None) -> 
 
 
 def mission_leg_of(report: LegReport, frame: LocalFrame) -> MissionLeg | None:
-    """Return the way of a leg, whether it ends in a stop or not; None where it is no place."""
+    """Return the way of a leg, whether it ends in a stop or not; None where it is not a place."""
     way = _way(
         report.received_s,
         (report.from_latitude_deg, report.from_longitude_deg),

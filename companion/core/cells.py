@@ -164,7 +164,7 @@ class CellGrid:
     ) -> None:
         rates = np.asarray(rates_l_ha, dtype=np.float64)
         if not ((rates >= 0.0) & (rates < 100_000.0)).all():
-            raise ValueError("a rate of the cells is no rate")
+            raise ValueError("a rate of the cells is not a rate")
         if classes.ndim != 2 or not classes.size:
             raise ValueError(f"cells need rows and columns: {classes.shape}")
         if not (classes.min() >= NO_RATE and classes.max() < len(rates)):

@@ -59,7 +59,7 @@ FADE_BY_ROUND_TRIP = 300.0
 RATE_SD = 0.005
 # How well the arrivals tell the rate of the exchanges, whose way may slow down and recover.
 RATE_BY_ARRIVALS_SD = 0.003
-# More than this is no clock's rate. Nothing is sprayed by such a clock.
+# More than this is not a clock's rate. Nothing is sprayed by such a clock.
 RATE_MAX = 0.03
 # Jitter of arrivals and exchanges at their best.
 ARRIVAL_SD_S = 0.002

@@ -2,7 +2,7 @@
 
 `step` has five stages, each a function of what it is given: what came of the last plan (`_watch`),
 whether anything may be sprayed (`permit`), the routes of the valves (`_routes`), their changes of
-duty (`_orders`), and the plan (`_plan`).
+duty (`_orders`), and the plan that they make.
 """
 
 from __future__ import annotations

@@ -251,7 +251,7 @@ class Track(NamedTuple):
 
 
 def observe(track: Track, item: Input, setup: Setup) -> Track:
-    """Return `track` with one more input; whatever is no number is kept out of the filter."""
+    """Return `track` with one more input; whatever is not a number is kept out of the filter."""
     if isinstance(item, Telemetry):
         return _observe_position(track, item, setup)
     order = noted(track.order, item)
@@ -579,7 +579,7 @@ def _height(track: Track, motion: Motion, now_s: float) -> float:
 def _checked_speed(track: Track, now_s: float) -> float | None:
     """Return the second opinion on the ground speed, if it is young enough.
 
-    One that is told and is no number agrees with nothing: NaN, which closes.
+    One that is told and is not a number agrees with nothing: NaN, which closes.
     """
     if track.speed is None or not _young(track.speed, now_s, SPEED_REPORT_AGE_MAX_S):
         return None

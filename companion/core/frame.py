@@ -46,7 +46,7 @@ class LocalFrame:
 
     def __post_init__(self) -> None:
         if not (abs(self.latitude_deg) <= 90.0 and abs(self.longitude_deg) <= 180.0):
-            raise ValueError(f"origin is no position: {self.latitude_deg}, {self.longitude_deg}")
+            raise ValueError(f"origin is not a position: {self.latitude_deg}, {self.longitude_deg}")
         object.__setattr__(self, "_forward", _into(self._definition))
 
     @property

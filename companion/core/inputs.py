@@ -51,7 +51,7 @@ class Telemetry:
 class SpeedReport:
     """Ground speed by a second way (VFR_HUD): the cross-check of the velocity.
 
-    `None` is a speed that the autopilot told and that is no number.
+    `None` is a speed that the autopilot told and that is not a number.
     """
 
     received_s: float
@@ -199,7 +199,7 @@ class FlowReport:
     """What the flow meter has counted since it was started: all valves, as its calibration has it.
 
     A count and not a flow, so that a mean over any time can be formed from two of them. With a
-    `fault` (pulses were lost, more came than can be) the volume is no number.
+    `fault` (pulses were lost, more came than can be) the volume is not a number.
     """
 
     received_s: float
@@ -241,7 +241,7 @@ class BatteryReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RateOverride:
-    """The operator's wish to spray a percentage of what is prescribed; see `rate.overridden`."""
+    """The operator's wish to spray a percentage of what is prescribed; see `nozzle.overridden`."""
 
     received_s: float
     percent: float

@@ -580,7 +580,7 @@ def turning(
     if heading_deg is None or before_deg is None:
         return STEADY
     if not abs(heading_deg - before_deg) <= 720.0:
-        return STEADY  # one of them is no number; the rate would never be one again
+        return STEADY  # one of them is not a number; the rate would never be one again
     turned_deg = (heading_deg - before_deg + 180.0) % 360.0 - 180.0
     foretold_deg, now = before.after(dt_s)
     # Both are means over the time between the two headings.

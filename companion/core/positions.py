@@ -46,7 +46,7 @@ ROUND_TRIP_MAX_S = 0.25
 # `time_boot_ms` has 32 bits, which begin anew after 50 days; TIMESYNC has 64.
 BOOT_WRAP_S = 2**32 / 1000.0
 _RUNS_MAX = 4
-# How late copies come is remembered for so long, up to twice; later than that is no copy's way.
+# How late copies come is remembered for so long, up to twice; later than that is not a copy's way.
 LATE_KEPT_S = 60.0
 LATE_MAX_S = 30.0
 # Copies of one way differ by this: a router's queue, a radio's repeats.

@@ -39,7 +39,7 @@ class Zone:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.rate_l_ha < 100_000.0:
-            raise ValueError(f"rate of zone {self.name} is no rate: {self.rate_l_ha}")
+            raise ValueError(f"rate of zone {self.name} is not a rate: {self.rate_l_ha}")
         if self.polygon.is_empty or not self.polygon.is_valid:
             raise ValueError(f"zone {self.name} is empty or not a valid polygon")
 

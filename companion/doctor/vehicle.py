@@ -298,7 +298,7 @@ _NAMES = {33: "position", 74: "speed", 24: "GNSS", 193: "estimator", 230: "estim
 T = TypeVar("T", bound=Input)
 
 
-class Ear:
+class VehicleListener:
     """Takes all that comes; also the one who is told of the autopilot's outputs."""
 
     def __init__(self, options: ServoOptions | None, now_s: Callable[[], float]) -> None:
@@ -389,10 +389,10 @@ async def listen(
 
     With `options` the outputs of a disarmed ArduPilot are ordered closed, to see whether they obey.
     """
-    ear = Ear(options, clock)
+    listener = VehicleListener(options, clock)
     troubles: list[str] = []
-    link.follow_outputs(ear)
-    link.on_order_ack(ear.results.append)
+    link.follow_outputs(listener)
+    link.on_order_ack(listener.results.append)
     link.on_event(lambda _at_s, kind, text: troubles.append(text) if kind == "link" else None)
     wake = asyncio.Event()
     began_s = clock()
@@ -401,15 +401,15 @@ async def listen(
     except LinkError as error:
         return Heard(url=url, refused=str(error))
     try:
-        rates, is_ordered = await _attend(link, ear, wake, options, began_s + wait_s, clock)
+        rates, is_ordered = await _attend(link, listener, wake, options, began_s + wait_s, clock)
     finally:
         await link.close()
-    return _heard(link, ear, url, clock() - began_s, troubles, rates, is_ordered)
+    return _heard(link, listener, url, clock() - began_s, troubles, rates, is_ordered)
 
 
 async def _attend(
     link: VehicleLink,
-    ear: Ear,
+    listener: VehicleListener,
     wake: asyncio.Event,
     options: ServoOptions | None,
     until_s: float,
@@ -421,17 +421,17 @@ async def _attend(
     ordered_s = float("-inf")
     while now_s < until_s:
         wake.clear()
-        ear.take(link.receive())
+        listener.take(link.receive())
         link.tell(None, now_s)
-        if _may_order(ear) and options is not None and now_s - ordered_s >= _CLOSE_EVERY_S:
+        if _may_order(listener) and options is not None and now_s - ordered_s >= _CLOSE_EVERY_S:
             ordered_s = now_s
             for channel, pulse_us in rest_pulses(options).items():
                 link.order(channel, pulse_us)
             link.flush_orders()
-        met_s = ear.met_s
+        met_s = listener.met_s
         if counts is None and met_s is not None and now_s - met_s >= _SETTLE_S:
             counts, counted_s = dict(link.component.codec.vehicle_counts), now_s
-        if counts is not None and now_s - counted_s >= _MEASURE_S and ear.is_learned:
+        if counts is not None and now_s - counted_s >= _MEASURE_S and listener.is_learned:
             break
         with suppress(TimeoutError):
             await asyncio.wait_for(wake.wait(), _STEP_S)
@@ -453,15 +453,15 @@ async def _attend(
     return rates, is_ordered
 
 
-def _may_order(ear: Ear) -> bool:
+def _may_order(listener: VehicleListener) -> bool:
     """Return whether closed may be ordered: to a disarmed ArduPilot, whose outputs show it."""
-    heartbeat = ear.latest(HeartbeatReport)
-    return heartbeat is not None and not heartbeat.armed and not ear.is_px4
+    heartbeat = listener.latest(HeartbeatReport)
+    return heartbeat is not None and not heartbeat.armed and not listener.is_px4
 
 
 def _heard(
     link: VehicleLink,
-    ear: Ear,
+    listener: VehicleListener,
     url: str,
     waited_s: float,
     troubles: list[str],
@@ -469,9 +469,9 @@ def _heard(
     is_ordered: bool,
 ) -> Heard:
     vehicle = link.component.codec.vehicle
-    heartbeat, position = ear.latest(HeartbeatReport), ear.latest(Telemetry)
-    gnss, estimator = ear.latest(GnssReport), ear.latest(EstimatorReport)
-    rc, wind = ear.latest(RcReport), ear.latest(WindReport)
+    heartbeat, position = listener.latest(HeartbeatReport), listener.latest(Telemetry)
+    gnss, estimator = listener.latest(GnssReport), listener.latest(EstimatorReport)
+    rc, wind = listener.latest(RcReport), listener.latest(WindReport)
     # Not its greeting and not its counts.
     said = tuple(text for text in troubles if not text.startswith(("vehicle: ", "in ")))
     heard = Heard(
@@ -490,9 +490,9 @@ def _heard(
         wind_m_s=None if wind is None else wind.speed_m_s,
         wind_from_deg=wind_from_deg(wind),
         is_clock_known=link.component.clock.is_known,
-        outputs_us=ear.outputs_us(),
+        outputs_us=listener.outputs_us(),
         is_closed_ordered=is_ordered,
-        order_results=tuple(ear.results),
+        order_results=tuple(listener.results),
     )
     if vehicle is None or heartbeat is None:
         return heard
@@ -503,5 +503,5 @@ def _heard(
         is_px4=vehicle.is_px4,
         is_armed=heartbeat.armed,
         mode=heartbeat.mode,
-        parameters=ear.parameters,
+        parameters=listener.parameters,
     )

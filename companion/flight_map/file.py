@@ -85,7 +85,7 @@ class FlightMap:
     def moved(self, east_m: float, north_m: float) -> Prescription:
         """Return the prescription, moved by the offset between map and receiver."""
         if not np.isfinite((east_m, north_m)).all():
-            raise ValueError(f"offset is no distance: {(east_m, north_m)}")
+            raise ValueError(f"offset is not a distance: {(east_m, north_m)}")
         if east_m == 0.0 and north_m == 0.0:
             return self.prescription
         return moved(self.prescription, east_m=east_m, north_m=north_m, is_bounded=self.is_bounded)
@@ -346,7 +346,7 @@ def read_flight_map(path: Path) -> FlightMap:
             raise ValueError(f"it is larger than {FILE_BYTES_MAX // 1024**2} MB")
         # Without locks, and without a look at the files that SQLite may find beside it.
         uri = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
-        # What is no number is refused, not warned of.
+        # What is not a number is refused, not warned of.
         with (
             closing(sqlite3.connect(uri, uri=True)) as connection,
             np.errstate(all="ignore"),
@@ -354,7 +354,7 @@ def read_flight_map(path: Path) -> FlightMap:
             distrust(connection, path.stat().st_size, tables=_TABLES)
             return _read(path, connection)
     except (*DAMAGE, shapely.errors.ShapelyError, MemoryError) as error:
-        raise _refused(path, f"this is no sound flight map: {one_line(error)[:200]}") from error
+        raise _refused(path, f"this is not a sound flight map: {one_line(error)[:200]}") from error
 
 
 def _refused(
@@ -430,7 +430,7 @@ def _prescription(
     _check_ground(ground)
     default = json.loads(meta["default_rate_l_ha"])
     if default is not None and not (type(default) in (int, float) and 0.0 <= default < 100_000.0):
-        raise ValueError("its default rate is no rate")
+        raise ValueError("its default rate is not a rate")
     if ground.cells is None and not is_bounded:
         raise ValueError("its zones have no border")
     return Prescription(
@@ -489,7 +489,7 @@ def _check_shapes(shapes: Sequence[Geometry], *, are_areas: bool = True) -> None
     if len(places) > VERTICES_MAX:
         raise ValueError(f"it has more than {VERTICES_MAX} vertices")
     if not bool((np.abs(places) <= EXTENT_MAX_M).all()):  # NaN is not
-        raise ValueError("a place in it is no number, or farther off than any field reaches")
+        raise ValueError("a place in it is not a number, or farther off than any field reaches")
     if are_areas and not bool(shapely.is_valid(array).all()):
         raise ValueError("a polygon crosses itself")
 
@@ -504,7 +504,7 @@ def _exclusions(connection: sqlite3.Connection) -> Iterable[Area]:
     _check_shapes(found)
     areas = [area for area in found if isinstance(area, Polygon | MultiPolygon)]
     if len(areas) != len(found):
-        raise ValueError("an exclusion is no polygon")
+        raise ValueError("an exclusion is not a polygon")
     return areas
 
 
@@ -513,14 +513,14 @@ def _polylines(connection: sqlite3.Connection) -> Iterator[Polyline]:
     _check_shapes(found, are_areas=False)
     for line in found:
         if not isinstance(line, LineString) or line.is_empty:
-            raise ValueError("a planned line is no line")
+            raise ValueError("a planned line is not a line")
         yield tuple((float(x), float(y)) for x, y in shapely.get_coordinates(line))
 
 
 def _source_rates(connection: sqlite3.Connection) -> Iterator[float]:
     for (rate,) in _rows(connection, "rate_l_ha", "source_rates", (float,)):
         if not 0.0 <= rate < 100_000.0:
-            raise ValueError("a rate of its source is no rate")
+            raise ValueError("a rate of its source is not a rate")
         yield rate
 
 

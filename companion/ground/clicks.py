@@ -136,7 +136,7 @@ def _unknown(flows: Sequence[ClickFlow]) -> ClickJudgement:
 
 
 def _ratio(law: ClickLaw, flow: ClickFlow, idle_ml_s: float) -> float | None:
-    """Return a valve's flow over the table's; None where the count is no number."""
+    """Return a valve's flow over the table's; None where the count is not a number."""
     expected_ml = law.valve_ml_s[flow.valve] * flow.open_s
     if not expected_ml > _LEAST_EXPECTED_ML or not flow.window_s >= flow.open_s:
         return None

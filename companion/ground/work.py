@@ -173,7 +173,7 @@ HOLD_S = 0.5
 STROKE_GAP_S = 0.01
 STROKES_MIN = 4
 STROKES_OVER_S = 0.3
-# Between clocks of two processes; what is further in the future is no time at all.
+# Between clocks of two processes; what is further in the future is not a time at all.
 EARLY_S = -0.1
 # Sums of times are right to far better than this, and no key repeats faster.
 

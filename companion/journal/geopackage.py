@@ -28,7 +28,7 @@ from companion.core.prescription import Prescription
 
 APPLICATION_ID = 0x47504B47  # "GPKG"
 USER_VERSION = 10400
-JOURNAL_VERSION = "2"  # what journals of each version have where: `versions.py`
+JOURNAL_VERSION = "2"  # what journals of each version have where: `reader.py`
 # Part of each page stays empty. Measured, a journal is 27.2 MB an hour with these, 27.5 with 2048,
 # and 28.2 with 512: two rows of `applied` fill such a page, a third does not go in.
 PAGE_BYTES = 1024

@@ -146,7 +146,7 @@ def check_programs(
             if kind == "table" and page and _TABLE.match(text):
                 found.add(str(name))
             elif kind in ("view", "table"):
-                raise ValueError(f"its {_short(name)} is no plain table")
+                raise ValueError(f"its {_short(name)} is not a plain table")
             elif writes and not (kind == "index" and _INDEX.match(text)):
                 raise ValueError(f"it has a program ({_short(name)}), as no journal has")
     except sqlite3.DatabaseError:
@@ -170,7 +170,7 @@ def _short(name: object) -> str:
 
 
 def check_beside(path: Path, *, writes: bool = False) -> None:
-    """Refuse by a ValueError what lies beside a journal and is no plain file of its own.
+    """Refuse by a ValueError what lies beside a journal and is not a plain file of its own.
 
     With `writes` the journal itself must be one too: a link would lead out of the folder.
     """
@@ -182,7 +182,7 @@ def check_beside(path: Path, *, writes: bool = False) -> None:
         if file == path and not writes:
             mode = file.stat().st_mode
         if not stat.S_ISREG(mode):
-            raise ValueError(f"{file.name} is no plain file")
+            raise ValueError(f"{file.name} is not a plain file")
     if writes:
         _check_rollback(path.with_name(path.name + "-journal"))
 

@@ -61,7 +61,7 @@ def refused(path: Path, error: Exception) -> JournalError:
     if isinstance(error, PermissionError):
         return JournalError(f"{path}: cannot be read: {text}")
     if isinstance(error, sqlite3.DatabaseError) and "not a database" in text:
-        return JournalError(f"{path}: is no journal; {_GIVE}")
+        return JournalError(f"{path}: is not a journal; {_GIVE}")
     return UnreadableError(f"{path}: is damaged: {text}")
 
 
@@ -74,7 +74,7 @@ def no_file(path: Path) -> JournalError:
 def check_kind(name: object, tables: Collection[str], *, is_geopackage: bool) -> None:
     """Refuse what is no journal by its tables: another database, another GeoPackage."""
     if not is_geopackage:
-        raise JournalError(f"{name}: is no journal; {_GIVE}")
+        raise JournalError(f"{name}: is not a journal; {_GIVE}")
     if len(_OWN.intersection(tables)) < _SOME:
         raise JournalError(f"{name}: is a GeoPackage, but no journal of a flight")
 
@@ -173,7 +173,7 @@ def as_far_as_said(
     try:
         int(found.setdefault("lost", "0"))
     except ValueError:
-        unread.append("what the flight said of lost is no number")
+        unread.append("what the flight said of lost is not a number")
         found["lost"] = "0"
     try:
         return migrated(found), unread

@@ -57,7 +57,7 @@ from companion.link.service import (
     REQUEST_MESSAGE,
     SET_MESSAGE_INTERVAL,
     Answer,
-    Desk,
+    CommandState,
     OnEvent,
     Service,
 )
@@ -127,14 +127,14 @@ class Component:
         self._announcer = Announcer(
             self._encoder, training=options.training, width_m=options.width_m
         )
-        self._desk = Desk(
+        self._command_state = CommandState(
             parameters=parameters if parameters is not None else Parameters(),
             tank=Tank(),
             may_enable=options.may_enable,
             page_may_enable=options.page_may_enable,
         )
         self._service = Service(
-            self._desk, self._encoder, self._announcer, self._send, version=options.version
+            self._command_state, self._encoder, self._announcer, self._send, version=options.version
         )
         self._mission = self._mission_reader()
         self._wind = WindWatch()
@@ -164,11 +164,11 @@ class Component:
     @property
     def on_refilled(self) -> Callable[[float], bool] | None:
         """Return who is told of a filling in litres, and says whether it can be one."""
-        return self._desk.on_refilled
+        return self._command_state.on_refilled
 
     @on_refilled.setter
     def on_refilled(self, take: Callable[[float], bool] | None) -> None:
-        self._desk.on_refilled = take
+        self._command_state.on_refilled = take
 
     @property
     def is_vehicle_known(self) -> bool:
@@ -178,7 +178,7 @@ class Component:
     @property
     def tank_l(self) -> float | None:
         """Return what is left in the tank, counted down from the last filling that was told."""
-        return self._desk.tank.level_l
+        return self._command_state.tank.level_l
 
     @property
     def address(self) -> tuple[int, int]:
@@ -258,7 +258,7 @@ class Component:
         self.outputs.tick(now_s)
         if self._mission is not None:
             self._mission.tick(
-                now_s, is_armed=self._desk.is_armed, flies_mission=self._flies_mission
+                now_s, is_armed=self._command_state.is_armed, flies_mission=self._flies_mission
             )
         self._ask_what_it_is(now_s)
         if self._supervisor is None:
@@ -298,7 +298,7 @@ class Component:
 
     def _ask_what_it_is(self, now_s: float) -> None:
         """Ask whether the vehicle is simulated, and have it in the record when that is known."""
-        is_armed = self._desk.is_armed
+        is_armed = self._command_state.is_armed
         name = None if is_armed else self.simulation.next_name(now_s)
         if name is not None:
             self._send(self._encoder.param_request_read(name))
@@ -348,7 +348,7 @@ class Component:
     def _look_at(self, item: Input) -> None:
         """Take from an input what the link itself has to know of it."""
         if isinstance(item, HeartbeatReport):
-            self._desk.is_armed = item.armed
+            self._command_state.is_armed = item.armed
             self._flies_mission = item.mode in MISSION_MODES
             self.outputs.armed(item.armed)
             self.simulation.heartbeat(is_hil=self.codec.is_hil)

@@ -63,7 +63,7 @@ class Answer:
 
 
 @dataclass(slots=True, kw_only=True)
-class Desk:
+class CommandState:
     """What commands look at and change."""
 
     parameters: Parameters
@@ -116,39 +116,39 @@ def stops(command: CommandReceived) -> bool:
     return command.command == USER_ESTOP or (command.command == DO_SPRAYER and command.param1 == 0)
 
 
-def _sprayer(desk: Desk, command: CommandReceived) -> Answer:
+def _sprayer(command_state: CommandState, command: CommandReceived) -> Answer:
     """Take the operator's wish: exactly 1 enables, exactly 0 disables."""
     if command.param1 not in (0.0, 1.0):
         return Answer(result=DENIED, text="DO_SPRAYER takes 0 or 1")
     enable = command.param1 == 1.0
-    if enable and command.source == "web" and not desk.page_may_enable:
+    if enable and command.source == "web" and not command_state.page_may_enable:
         return Answer(result=DENIED, text="enable by page: see safety.enable_by")
-    if enable and command.source == "command" and not desk.may_enable:
+    if enable and command.source == "command" and not command_state.may_enable:
         return Answer(result=DENIED, text="enable by command: see safety.enable_by")
     if enable and command.target_system == 0:
         return Answer(result=DENIED, text="enable: name this vehicle's system, not 0")
-    if enable and desk.is_old(command):
+    if enable and command_state.is_old(command):
         return Answer(result=REJECTED_FOR_NOW, text="late enable not taken: enable again")
-    desk.stopped_s = None if enable else command.received_s
+    command_state.stopped_s = None if enable else command.received_s
     if enable:
-        desk.enabled_by = (command.sender, command.sequence)
+        command_state.enabled_by = (command.sender, command.sequence)
     wish = OperatorCommand(received_s=command.received_s, enable=enable, source=command.source)
     return Answer(result=ACCEPTED, inputs=(wish,))
 
 
-def _estop(desk: Desk, command: CommandReceived) -> Answer:
+def _estop(command_state: CommandState, command: CommandReceived) -> Answer:
     """Take an emergency stop, whatever its parameters: DO_SPRAYER 0 ends it."""
-    desk.stopped_s = command.received_s
+    command_state.stopped_s = command.received_s
     stop = EstopReport(received_s=command.received_s, pressed=True, source="command")
     return Answer(result=ACCEPTED, inputs=(stop,), text="emergency stop", event="emergency stop")
 
 
-def rate_override(desk: Desk, percent: float | None, received_s: float) -> Answer:
+def rate_override(command_state: CommandState, percent: float | None, received_s: float) -> Answer:
     """Take another percentage of the prescribed rates, by command or by parameter."""
-    refusal = desk.parameters.set(RATE_PERCENT, percent, is_frozen=False)
+    refusal = command_state.parameters.set(RATE_PERCENT, percent, is_frozen=False)
     if refusal is not None:
         return Answer(result=DENIED, text=f"rate override: {refusal}")
-    taken = desk.parameters.get(RATE_PERCENT, 100.0)
+    taken = command_state.parameters.get(RATE_PERCENT, 100.0)
     return Answer(
         result=ACCEPTED,
         inputs=(RateOverride(received_s=received_s, percent=taken),),
@@ -157,31 +157,35 @@ def rate_override(desk: Desk, percent: float | None, received_s: float) -> Answe
     )
 
 
-def _user_rate(desk: Desk, command: CommandReceived) -> Answer:
-    if desk.parameters.index(RATE_PERCENT) is None:
+def _user_rate(command_state: CommandState, command: CommandReceived) -> Answer:
+    if command_state.parameters.index(RATE_PERCENT) is None:
         return Answer(result=UNSUPPORTED)
-    return rate_override(desk, command.param1, command.received_s)
+    return rate_override(command_state, command.param1, command.received_s)
 
 
-def _refilled(desk: Desk, command: CommandReceived) -> Answer:
-    if desk.is_open:
+def _refilled(command_state: CommandState, command: CommandReceived) -> Answer:
+    if command_state.is_open:
         return Answer(result=REJECTED_FOR_NOW, text="refilled: stop spraying first")
-    before_l = desk.tank.level_l
-    if not desk.tank.filled(command.param1):
-        most_l = desk.tank.capacity_l
+    before_l = command_state.tank.level_l
+    if not command_state.tank.filled(command.param1):
+        most_l = command_state.tank.capacity_l
         advice = "give litres" if most_l is None else f"0 to {most_l:g} L"
         return Answer(result=DENIED, text=f"refilled: {advice}")
-    level_l = desk.tank.level_l
-    if level_l is not None and desk.on_refilled is not None and not desk.on_refilled(level_l):
-        desk.tank.level_l = before_l
+    level_l = command_state.tank.level_l
+    if (
+        level_l is not None
+        and command_state.on_refilled is not None
+        and not command_state.on_refilled(level_l)
+    ):
+        command_state.tank.level_l = before_l
         return Answer(result=DENIED, text="refilled: more than tank.capacity_l")
-    text = f"tank {desk.tank.level_l:g} L"
+    text = f"tank {command_state.tank.level_l:g} L"
     return Answer(result=ACCEPTED, text=text, event=f"refilled, {text}")
 
 
-def declared(desk: Desk, report: DeclarationReport) -> Answer:
+def declared(command_state: CommandState, report: DeclarationReport) -> Answer:
     """Take what the operator observed: on the ground only, where somebody can look again."""
-    if desk.is_armed or desk.is_open:
+    if command_state.is_armed or command_state.is_open:
         return Answer(result=REJECTED_FOR_NOW, text="declare: land and disarm first")
     # Where nothing is limited nothing is kept either: it is for the record.
     text = f"declared, not kept: {len(report.broken)}" if report.broken else "declared"
@@ -190,31 +194,31 @@ def declared(desk: Desk, report: DeclarationReport) -> Answer:
     )
 
 
-def _next_map(desk: Desk, _command: CommandReceived) -> Answer:
-    if desk.is_armed or desk.is_open:
+def _next_map(command_state: CommandState, _command: CommandReceived) -> Answer:
+    if command_state.is_armed or command_state.is_open:
         return Answer(result=DENIED, text="next map: disarm first")
     return Answer(result=DENIED, text="next map: there is only one")
 
 
-def _reboot(_desk: Desk, _command: CommandReceived) -> Answer:
+def _reboot(_command_state: CommandState, _command: CommandReceived) -> Answer:
     return Answer(result=DENIED, text="no reboot by MAVLink")
 
 
-def _request_message(desk: Desk, command: CommandReceived) -> Answer:
+def _request_message(command_state: CommandState, command: CommandReceived) -> Answer:
     if command.param1 is None or command.param1 not in OWN_MESSAGES:
         return Answer(result=UNSUPPORTED)
     number = command.param2
     index = int(number) if number is not None and 0 <= number < 1e4 else -1
-    if command.param1 == PARAM_VALUE and desk.parameters.at(index) is None:
+    if command.param1 == PARAM_VALUE and command_state.parameters.at(index) is None:
         return Answer(result=DENIED)
     return Answer(result=ACCEPTED, send=int(command.param1), send_index=index)
 
 
-def _version(_desk: Desk, _command: CommandReceived) -> Answer:
+def _version(_command_state: CommandState, _command: CommandReceived) -> Answer:
     return Answer(result=ACCEPTED, send=AUTOPILOT_VERSION)
 
 
-def _set_interval(desk: Desk, command: CommandReceived) -> Answer:
+def _set_interval(command_state: CommandState, command: CommandReceived) -> Answer:
     """Set how often our values are told; the signs of life are nobody's to change."""
     if command.param1 == HEARTBEAT:
         return Answer(result=DENIED, text="our heartbeat is 1 Hz")
@@ -222,22 +226,22 @@ def _set_interval(desk: Desk, command: CommandReceived) -> Answer:
         return Answer(result=UNSUPPORTED)
     interval_us = command.param2
     if interval_us == 0.0:
-        desk.values_hz = desk.parameters.get(VALUES_HZ, 1.0)
+        command_state.values_hz = command_state.parameters.get(VALUES_HZ, 1.0)
         return Answer(result=ACCEPTED)
     # -1, which switches a message off, is refused: another station may be looking.
     if interval_us is None or not 1e6 / VALUES_HZ_MAX <= interval_us <= 1e6 / VALUES_HZ_MIN:
         return Answer(result=DENIED, text=f"values: {VALUES_HZ_MIN:g} to {VALUES_HZ_MAX:g} Hz")
-    desk.values_hz = 1e6 / interval_us
+    command_state.values_hz = 1e6 / interval_us
     return Answer(result=ACCEPTED)
 
 
-def _get_interval(_desk: Desk, command: CommandReceived) -> Answer:
+def _get_interval(_command_state: CommandState, command: CommandReceived) -> Answer:
     number = command.param1
     is_id = number is not None and 0 <= number < 65536
     return Answer(result=ACCEPTED, interval_of=int(number or 0.0) if is_id else 65535)
 
 
-_HANDLERS: dict[int, Callable[[Desk, CommandReceived], Answer]] = {
+_HANDLERS: dict[int, Callable[[CommandState, CommandReceived], Answer]] = {
     DO_SPRAYER: _sprayer,
     PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
     GET_MESSAGE_INTERVAL: _get_interval,
@@ -262,30 +266,30 @@ class Service:
 
     def __init__(
         self,
-        desk: Desk,
+        command_state: CommandState,
         encoder: Encoder,
         announcer: Announcer,
         send: Callable[[bytes], bool],
         *,
         version: Version,
     ) -> None:
-        self._desk = desk
+        self._command_state = command_state
         self._encoder = encoder
         self._announcer = announcer
         self._send = send
         self._version = version
-        self._server = ParameterServer(desk, encoder)
+        self._server = ParameterServer(command_state, encoder)
         self._decision: Decision | None = None
         self.on_event: OnEvent | None = None
-        take_over(desk)
+        take_over(command_state)
 
     def look_at(self, decision: Decision | None, now_s: float) -> None:
         """Take what was decided: what may be changed, and what is left in the tank."""
-        desk, self._decision = self._desk, decision
-        desk.look_at(decision, now_s)
-        desk.tank.flows(0.0 if decision is None else decision.flow_l_min, now_s)
-        self._announcer.tank_l = desk.tank.level_l
-        self._announcer.set_values_rate(desk.values_hz)
+        command_state, self._decision = self._command_state, decision
+        command_state.look_at(decision, now_s)
+        command_state.tank.flows(0.0 if decision is None else decision.flow_l_min, now_s)
+        self._announcer.tank_l = command_state.tank.level_l
+        self._announcer.set_values_rate(command_state.values_hz)
 
     def tick(self, now_s: float) -> None:
         """Send the next parameter of a list, if it is its turn."""
@@ -299,12 +303,12 @@ class Service:
             target = self._encoder.component_id
         if not self._is_ours(command.target_system, target):
             return ()
-        answer, sender = self._desk.obey(command), command.sender
+        answer, sender = self._command_state.obey(command), command.sender
         self._send(
             self._encoder.ack(command.command, answer.result, sender.system_id, sender.component_id)
         )
         self._tell(answer, command.received_s)
-        index = self._desk.parameters.index(RATE_PERCENT)
+        index = self._command_state.parameters.index(RATE_PERCENT)
         if command.command == USER_RATE and index is not None and answer.inputs:
             self._tell_value(index)
         return answer.inputs
@@ -325,13 +329,13 @@ class Service:
             param2=None,
             source="web",
         )
-        answer = self._desk.obey(command)
+        answer = self._command_state.obey(command)
         self._tell(answer, received_s)
         return answer
 
     def declare(self, report: DeclarationReport) -> Answer:
         """Take what the operator declared on the page; the ground station is told of it."""
-        answer = declared(self._desk, report)
+        answer = declared(self._command_state, report)
         self._tell(answer, report.received_s)
         return answer
 
@@ -379,7 +383,7 @@ class Service:
             self._send_message(answer.send, answer.send_index, at_s)
 
     def _interval(self, message_id: int) -> bytes:
-        values_us = round(1e6 / self._desk.values_hz)
+        values_us = round(1e6 / self._command_state.values_hz)
         known = {HEARTBEAT: 1_000_000, NAMED_VALUE_FLOAT: values_us}
         return self._encoder.message_interval(message_id, known.get(message_id, 0))
 
@@ -413,17 +417,17 @@ class Values:
 
 
 class ParameterServer:
-    """Answers for `desk`; a list that is asked for again begins anew and waits in no queue."""
+    """Answers; a list that is asked for again begins anew and waits in no queue."""
 
-    def __init__(self, desk: Desk, encoder: Encoder) -> None:
-        self._desk = desk
+    def __init__(self, command_state: CommandState, encoder: Encoder) -> None:
+        self._command_state = command_state
         self._encoder = encoder
         self._next: int | None = None
         self._next_s = float("-inf")
 
     def ask(self, asked: ParamAsked) -> Values:
         """Take a request; a list is told by `due`."""
-        parameters = self._desk.parameters
+        parameters = self._command_state.parameters
         if asked.is_all:
             self._next = 0
             return Values()
@@ -434,8 +438,8 @@ class ParameterServer:
 
     def set(self, wanted: ParamSet) -> Values:
         """Take a value or keep the old one; either way the one that holds is told."""
-        desk = self._desk
-        index = desk.parameters.index(wanted.name)
+        command_state = self._command_state
+        index = command_state.parameters.index(wanted.name)
         if index is None:
             return Values()
         told = (index,)
@@ -443,17 +447,19 @@ class ParameterServer:
             text = f"{wanted.name}: type REAL32 only"
             return Values(indices=told, answer=Answer(result=0, text=text))
         if wanted.name == RATE_PERCENT:
-            return Values(indices=told, answer=rate_override(desk, wanted.value, wanted.received_s))
-        before = desk.parameters.get(wanted.name, 0.0)
-        refusal = desk.parameters.set(
-            wanted.name, wanted.value, is_frozen=desk.is_armed or desk.is_open
+            return Values(
+                indices=told, answer=rate_override(command_state, wanted.value, wanted.received_s)
+            )
+        before = command_state.parameters.get(wanted.name, 0.0)
+        refusal = command_state.parameters.set(
+            wanted.name, wanted.value, is_frozen=command_state.is_armed or command_state.is_open
         )
         if refusal is not None:
             return Values(indices=told, answer=Answer(result=0, text=f"{wanted.name}: {refusal}"))
-        after = desk.parameters.get(wanted.name, 0.0)
+        after = command_state.parameters.get(wanted.name, 0.0)
         if after == before:
             return Values(indices=told)
-        take_over(desk)
+        take_over(command_state)
         when = ", at next start" if wanted.name not in (VALUES_HZ, TANK_L) else ""
         text = f"{wanted.name} {after:g}{when}"
         return Values(indices=told, answer=Answer(result=0, text=text, event=text))
@@ -465,21 +471,21 @@ class ParameterServer:
         self._next_s = now_s + PACE_S
         frame = self.value(self._next)
         self._next += 1
-        if self._next >= len(self._desk.parameters):
+        if self._next >= len(self._command_state.parameters):
             self._next = None
         if frame is not None:
             yield frame
 
     def value(self, index: int) -> bytes | None:
         """Return PARAM_VALUE of the parameter at `index`; None where there is none."""
-        found = self._desk.parameters.at(index)
+        found = self._command_state.parameters.at(index)
         if found is None:
             return None
         name, value = found
-        return self._encoder.param_value(name, value, len(self._desk.parameters), index)
+        return self._encoder.param_value(name, value, len(self._command_state.parameters), index)
 
 
-def take_over(desk: Desk) -> None:
+def take_over(command_state: CommandState) -> None:
     """Have the parameters that act at once act."""
-    desk.values_hz = desk.parameters.get(VALUES_HZ, 1.0)
-    desk.tank.capacity_l = desk.parameters.get(TANK_L, 0.0) or None
+    command_state.values_hz = command_state.parameters.get(VALUES_HZ, 1.0)
+    command_state.tank.capacity_l = command_state.parameters.get(TANK_L, 0.0) or None

@@ -306,7 +306,7 @@ def _reason(url: LinkUrl, error: OSError) -> str:
     if error.errno == errno.EACCES:
         return f"port {url.number} is not allowed to this user; write one above 1023"
     if error.errno == errno.EADDRNOTAVAIL:
-        return f"{url.place} is no address of this computer; write 127.0.0.1 or 0.0.0.0"
+        return f"{url.place} is not an address of this computer; write 127.0.0.1 or 0.0.0.0"
     return f"cannot be opened ({error.strerror or error}); check host and port"
 
 

@@ -212,7 +212,7 @@ def _pin(options: ServoOptions, known: Known, channel: int, name: str) -> Iterat
 
 
 def is_open(options: ServoOptions, pulse_us: float, drive: DriveOutput | None) -> bool:
-    """Return whether a pulse opens a valve: it lies on the side of `full_us`, or is no number."""
+    """Return whether a pulse opens a valve: it lies on the side of `full_us`, or is none."""
     if drive is not None:
         return not pulse_us <= drive.stop_us
     share = (pulse_us - options.closed_us) / (options.full_us - options.closed_us)

@@ -125,7 +125,7 @@ def reasons_of(codes: Sequence[str]) -> list[dict[str, Any]]:
 
 
 @dataclass(slots=True)
-class Way:
+class BoomTrace:
     """Where the boom went and with which valves open; sums of area and volume."""
 
     valves: tuple[tuple[float, float, float], ...]  # right, forward, width [m]
@@ -301,7 +301,7 @@ class Live:
             (valve["right_m"], valve["forward_m"], valve["width_m"])
             for valve in ground["boom"]["valves"]
         )
-        self.way = Way(valves)
+        self.way = BoomTrace(valves)
         self.field_m2 = float(ground["field_m2"])
         self.state: dict[str, Any] = {}
         self.version = 0
@@ -355,7 +355,7 @@ class Live:
         if is_simulated == self._is_simulated or not is_known:
             return
         self._is_simulated = is_simulated
-        self.way = Way(self.way.valves)
+        self.way = BoomTrace(self.way.valves)
         utc_s, begun_s = self._begun_s
         self.way_id = round(utc_s + time.monotonic() - begun_s, 1)
         self.close()

@@ -8,7 +8,7 @@ full. The writer overwrites the oldest slot; a reader that falls behind loses th
 nothing else. Each slot has its number and a checksum, so that a reader that is overtaken while it
 reads notices it: there is no lock that anybody could hold.
 
-The page is a process of its own. What it shows goes through shared memory (`frames.py`), which is
+The page is a process of its own. What it shows goes through shared memory (`live.py`), which is
 never full and never waited for; what it orders comes back in small packets, of which a few are
 read in each step. So nothing that a browser does, or the page's own end, can delay a valve. A page
 that ends is started again.

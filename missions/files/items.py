@@ -100,7 +100,7 @@ def _item(item: dict[str, Any]) -> Problems:
     if not _are_numbers(params, PARAMS):
         yield f"params must be {PARAMS} numbers or null"
     elif item.get("frame") in MODE_FRAMES.values() and not _is_place(params[4:6]):
-        yield f"{params[4]}, {params[5]} is no place"
+        yield f"{params[4]}, {params[5]} is not a place"
     yield from _altitude(item)
 
 

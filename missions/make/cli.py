@@ -259,7 +259,7 @@ def _wish(
     points = [] if law is None else _law(law)
     for rate in (*table, *(rate for _, rate in points)):
         if not 0.0 <= rate < 10_000.0:
-            raise typer.BadParameter(f"{rate:g} L/ha is no rate")
+            raise typer.BadParameter(f"{rate:g} L/ha is not a rate")
     number = count or (len(table) if table else 4)
     if (table and len(table) != number) or number > ZONES_MAX:
         raise typer.BadParameter(

@@ -95,7 +95,7 @@ def _by_valve(passes: Passes, config: Config) -> Passes:
     widths = [width_m for _, width_m in valves]
     if not np.allclose(widths, widths[::-1], atol=0.01):
         raise ConfigError(
-            f"{config.path}: [[valve]] width_m: the boom's left half is no mirror of its right "
+            f"{config.path}: [[valve]] width_m: the boom's left half is not a mirror of its right "
             "one, so that zones as wide as a valve fit one direction alone; leave out --across"
         )
     return by_valve(passes, widths)

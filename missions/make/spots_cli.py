@@ -255,7 +255,7 @@ def read_weeds(
         found = read_layer(path, layer=layer)
         if isinstance(found, Grid):
             raise map_error(
-                path, "a raster is no weeds", fix="export points or polygons", code="no-polygon"
+                path, "a raster holds no weeds", fix="export points or polygons", code="no-polygon"
             )
         native, _ = crs_of(found, path, crs)
         marks, _ = points_of(found)

@@ -134,11 +134,11 @@ def _parsed(content: bytes, path: Path) -> Json:
     try:
         root = json.loads(content.decode("utf-8-sig"))
         if not isinstance(root, dict):
-            raise ValueError("it is no object")
+            raise ValueError("it is not an object")
     except (ValueError, RecursionError) as error:
         raise map_error(
             path,
-            f"this is no readable {NAME} ({str(error)[:120]})",
+            f"this is not a readable {NAME} ({str(error)[:120]})",
             fix=_EXPORT_AGAIN,
             code="truncated",
         ) from None
@@ -214,7 +214,7 @@ def _variable(one: Json, products: dict[str, str], units: dict[str, str]) -> Var
 def _number(value: object) -> float | None:
     """Return a rate that is a number, None for what is not there.
 
-    What is no number, or beyond all, becomes NaN, which nobody takes for a rate.
+    What is not a number, or beyond all, becomes NaN, which nobody takes for a rate.
     """
     if value is None:
         return None
@@ -298,7 +298,7 @@ def _geo(text: bytes | None, path: Path) -> dict[str, Any]:
     try:
         found = json.loads(text)
         if not isinstance(found, dict):
-            raise ValueError("it is no object")
+            raise ValueError("it is not an object")
     except (ValueError, RecursionError) as error:
         raise map_error(
             path,

@@ -276,7 +276,7 @@ def _bad_rate(path: Path, column: Column | Band, where: str, value: object) -> E
     shown = repr(value)[:40]
     return map_error(
         path,
-        f"{column.name} of {where} is {shown}, which is no rate",
+        f"{column.name} of {where} is {shown}, which is not a rate",
         fix="correct the value (leave it blank where nothing is prescribed), or name another "
         "column with --rate-field (prescription.rate_field)",
         code="bad-rate",

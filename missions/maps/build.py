@@ -64,7 +64,7 @@ def build_prescription(
     policy = _policy(map_file, overlap)
     offset_m = (offset_east_m, offset_north_m)
     if not np.isfinite(offset_m).all():
-        raise ValueError(f"offset is no distance: {offset_m}")
+        raise ValueError(f"offset is not a distance: {offset_m}")
     if boundary is None:
         boundary = map_file.boundary
     if default_rate_l_ha is None and map_file.boundary is not None:

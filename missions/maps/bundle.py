@@ -157,7 +157,7 @@ def _broken(content: bytes, error: Exception, path: Path, where: str) -> Excepti
                 )
     return map_error(
         path,
-        f"{where}this is no whole XML file ({reason})",
+        f"{where}this is not a whole XML file ({reason})",
         fix=f"copy it again, or {_EXPORT_AGAIN}",
         code="truncated",
     )
@@ -323,7 +323,7 @@ def _archive(path: Path) -> Bundle:
     except _BROKEN as error:
         raise map_error(
             path,
-            f"this is no whole zip archive ({str(error)[:120]})",
+            f"this is not a whole zip archive ({str(error)[:120]})",
             fix=f"copy it again, or {_MAKE_AGAIN}",
             code="truncated",
         ) from None

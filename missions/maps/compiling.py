@@ -329,10 +329,10 @@ def _place(path: Path, place: Any, frame: LocalFrame) -> Place:
         or len(place) < 2
         or not all(type(number) in (int, float) for number in place[:2])
     ):
-        raise _refused(path, f"{str(place)[:60]} is no longitude and latitude")
+        raise _refused(path, f"{str(place)[:60]} is not a longitude and latitude")
     longitude_deg, latitude_deg = float(place[0]), float(place[1])
     if not (abs(longitude_deg) <= 180.0 and abs(latitude_deg) <= 90.0):
-        raise _refused(path, f"{str(place)[:60]} is no longitude and latitude")
+        raise _refused(path, f"{str(place)[:60]} is not a longitude and latitude")
     return frame.to_local(latitude_deg, longitude_deg)
 
 

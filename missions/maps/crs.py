@@ -59,7 +59,7 @@ def parse_crs(text: str, *, path: Path, source: str) -> CRS:
             reason = "it is unknown or damaged"
         raise map_error(
             path,
-            f"{source} is no usable coordinate reference system ({reason[:120]})",
+            f"{source} is not a usable coordinate reference system ({reason[:120]})",
             fix="give it with --crs, for example --crs EPSG:4326",
             code="wrong-crs",
         ) from None
@@ -112,7 +112,7 @@ def to_longitude_latitude(geometries: Objects, crs: CRS, *, path: Path) -> Objec
     if not bool(np.isfinite(coordinates).all()):
         raise map_error(
             path,
-            "a coordinate is no finite number",
+            "a coordinate is not a finite number",
             fix="export the map again",
             code="broken-geometry",
         )

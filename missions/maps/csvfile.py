@@ -168,7 +168,7 @@ def _check_degrees(table: Table, longitude_deg: Floats, latitude_deg: Floats) ->
     raise map_error(
         table.path,
         f"line {table.lines[index]}: latitude {latitude_deg[index]:.10g}, longitude "
-        f"{longitude_deg[index]:.10g} is no place"
+        f"{longitude_deg[index]:.10g} is not a place"
         + ("; the two look exchanged" if exchanged else ""),
         fix="exchange the names of the two columns"
         if exchanged
@@ -315,7 +315,7 @@ class Table:
         return found
 
     def first_text(self, name: str) -> int:
-        """Return the row of the first cell that is no number, 0 where all are."""
+        """Return the row of the first cell that is not a number, 0 where all are."""
         values = self.columns[name]
         return next((i for i, one in enumerate(values) if not _NUMBER.fullmatch(one.strip())), 0)
 
@@ -328,7 +328,7 @@ class Table:
             return
         raise map_error(
             self.path,
-            f"line {self.lines[bad[0]]}: {name} is {tidy[bad[0]][:40]!r}, which is no number",
+            f"line {self.lines[bad[0]]}: {name} is {tidy[bad[0]][:40]!r}, which is not a number",
             fix="write a number like 12.5, or leave it blank",
             code="bad-number",
         )
@@ -373,7 +373,7 @@ def read_table(content: bytes, path: Path, *, wanted: Callable[[Sequence[str]], 
         except csv.Error as error:
             raise map_error(
                 path,
-                f"this is no whole CSV file ({str(error)[:80]})",
+                f"this is not a whole CSV file ({str(error)[:80]})",
                 fix=_AS_CSV,
                 code="truncated",
             ) from None
@@ -384,7 +384,7 @@ def read_table(content: bytes, path: Path, *, wanted: Callable[[Sequence[str]], 
 def _check_end(text: str, table: Table) -> None:
     """Refuse a last line without an end, unless its last field shows that it is whole.
 
-    A quotation mark closes a field, and a text is no rate. A number and a blank may be what is
+    A quotation mark closes a field, and a text is not a rate. A number and a blank may be what is
     left of a longer number.
     """
     last = [values[-1] for values in table.columns.values()][-1].strip()
@@ -414,7 +414,7 @@ def _text(content: bytes, path: Path) -> str:
     if "\0" in text:
         # Which letter such a byte is depends on the program that wrote it: it is not guessed.
         raise map_error(
-            path, f"this is no text in UTF-8{where}", code="encoding",
+            path, f"this is not text in UTF-8{where}", code="encoding",
             fix=f"{_AS_CSV}, or: iconv -f WINDOWS-1252 -t UTF-8 FILE > NEW.csv",
         )  # fmt: skip
     return text
@@ -432,7 +432,7 @@ def _delimiter(text: str, path: Path, wanted: Callable[[Sequence[str]], bool]) -
         path,
         "the file is empty"
         if not any(names)
-        else f"its first line ({shown}) is no header"
+        else f"its first line ({shown}) is not a header"
         if headless
         else f"no columns say where the rates belong; its columns are {shown}",
         fix="name the columns in the first line: lat and lon, or easting and northing, or wkt",

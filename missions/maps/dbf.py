@@ -278,7 +278,7 @@ class Texts:
         if self._declared is None:
             unknown = self._unknown_cpg.decode("ascii", "replace")[:40]
             text = (
-                f"its .cpg says {unknown!r}, which is no known encoding"
+                f"its .cpg says {unknown!r}, which is not a known encoding"
                 if unknown
                 else "no .cpg and no code page says in which encoding its texts are"
             )

@@ -350,7 +350,7 @@ def unit_of(layer: Layer | Grid, rate: Column | Band, *, given: Given, path: Pat
     if unknown and (wanted is None or any(map(is_mass_per_area, unknown))):
         raise map_error(
             path,
-            f"its unit {unknown[0][:40]!r} is no volume per area",
+            f"its unit {unknown[0][:40]!r} is not a volume per area",
             fix=_FIX,
             code="not-a-volume",
         )
@@ -463,7 +463,7 @@ def _wanted(asked: str, path: Path) -> RateUnit:
     if found is None:
         raise map_error(
             path,
-            f"the unit {asked!r} is no volume per area",
+            f"the unit {asked!r} is not a volume per area",
             fix=_FIX,
             code="not-a-volume",
         )

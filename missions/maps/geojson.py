@@ -100,7 +100,7 @@ def _parse(content: bytes, path: Path) -> dict[str, object]:
         document = json.loads(content.decode("utf-8-sig"), object_pairs_hook=_members)
     except UnicodeDecodeError as error:
         if b"\0" in content:
-            text = "this is no text, so it cannot be GeoJSON"
+            text = "this is not text, so it cannot be GeoJSON"
             raise map_error(path, text, fix=_EXPORT_AGAIN, code="encoding") from None
         text = f"its text is not in UTF-8, as GeoJSON has to be ({error.reason})"
         raise map_error(path, text, fix="save it as UTF-8", code="encoding") from None
@@ -141,7 +141,7 @@ def _features(document: dict[str, object], path: Path) -> list[dict[str, object]
     if kind not in ("FeatureCollection", "Feature") or not isinstance(features, list):
         raise _no_map(path, f"GeoJSON of type {kind[:40]!r} is no map")
     if not all(isinstance(feature, dict) for feature in features):
-        raise _no_map(path, "a feature is no object")
+        raise _no_map(path, "a feature is not an object")
     return features
 
 
@@ -284,7 +284,7 @@ _DEPTH_MAX = 8  # of collections in each other
 def polygons_in(geometry: object, *, depth: int = 0) -> Iterator[Polygon]:
     """Yield every polygon of a geometry; raises one of `BROKEN` where it is none."""
     if not isinstance(geometry, dict) or depth > _DEPTH_MAX:
-        raise ValueError("it is no geometry")
+        raise ValueError("it is not a geometry")
     kind = geometry.get("type")
     if kind not in GEOMETRIES:
         raise ValueError(f"its type is {kind!r}")

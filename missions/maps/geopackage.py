@@ -177,7 +177,7 @@ def _found(database: Database, table: LayerTable, index: int, blob: Cell) -> Fou
         return None
     try:
         if not isinstance(blob, bytes):
-            raise ValueError("it is no geometry")
+            raise ValueError("it is not a geometry")
         srs_id, start = _header(blob)
         found = polygons_in(blob, start)
     except CurvedError as error:

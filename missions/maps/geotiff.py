@@ -274,7 +274,7 @@ def _boundary(
         index, reason = next(iter(layer.skipped.items()))
         raise map_error(
             where,
-            f"record {index + 1} of the boundary is no area: {reason}",
+            f"record {index + 1} of the boundary is not an area: {reason}",
             fix="draw the boundary as polygons",
             code="no-polygon",
         )

@@ -156,7 +156,7 @@ def filled_fault(raw: RawBand, value: float, path: Path) -> MapError:
     beside = "" if raw.nodata is None else f" beside its no-data value {raw.nodata:.6g}"
     return map_error(
         path,
-        f"{raw.name} holds {value:.6g}{beside}, which is no rate and not declared as no data",
+        f"{raw.name} holds {value:.6g}{beside}, which is not a rate and not declared as no data",
         fix=f"export the map again with {value:.6g} declared as its no-data value",
         code="nodata-undeclared",
     )
@@ -227,7 +227,7 @@ def parse_world_file(content: bytes, path: Path, *, alone: bool = False) -> Affi
     except ValueError as error:
         raise map_error(
             path,
-            f"this is no world file of six numbers ({str(error)[:80]})",
+            f"this is not a world file of six numbers ({str(error)[:80]})",
             fix="export the map again; numbers take a decimal point, not a comma",
             code="bad-world-file",
         ) from None
@@ -240,7 +240,7 @@ def parse_world_file(content: bytes, path: Path, *, alone: bool = False) -> Affi
 def _number(text: str) -> float:
     number = float(text)
     if not abs(number) <= 1e9:
-        raise ValueError(f"{text} is no finite number")
+        raise ValueError(f"{text} is not a finite number")
     return number
 
 

@@ -137,14 +137,14 @@ def positions(text: str) -> Floats:
     widths = {one.count(",") for one in tuples}
     if not widths <= {1, 2} or "_" in text:
         shown = next((one for one in tuples if one.count(",") not in (1, 2)), text.strip())
-        raise ValueError(f"{shown[:40]!r} is no longitude, latitude and height")
+        raise ValueError(f"{shown[:40]!r} is not a longitude, latitude and height")
     if len(widths) > 1:
         tuples = [",".join(one.split(",")[:2]) for one in tuples]
         widths = {1}
     try:
         numbers = [float(number) for number in ",".join(tuples).split(",")] if tuples else []
     except ValueError:
-        raise ValueError("a longitude, latitude or height is no number") from None
+        raise ValueError("a longitude, latitude or height is not a number") from None
     points = np.array(numbers, dtype=np.float64).reshape(-1, max(widths, default=1) + 1)[:, :2]
     check_coordinates(points)
     return points

@@ -52,7 +52,7 @@ class MapZone:
 
     def __post_init__(self) -> None:
         if self.rate_l_ha is not None and not 0.0 <= self.rate_l_ha < RATE_MAX_L_HA:
-            raise ValueError(f"rate of zone {self.name} is no rate: {self.rate_l_ha}")
+            raise ValueError(f"rate of zone {self.name} is not a rate: {self.rate_l_ha}")
 
     @property
     def part_count(self) -> int:
@@ -91,7 +91,7 @@ class MapCells:
         with np.errstate(invalid="ignore"):
             wrong = ~np.isnan(rates) & ~((rates >= 0.0) & (rates < RATE_MAX_L_HA))
         if wrong.any():
-            raise ValueError(f"rate of a cell is no rate: {rates[wrong][0]}")
+            raise ValueError(f"rate of a cell is not a rate: {rates[wrong][0]}")
         a, b, _, d, e, _ = self.transform
         if not (np.isfinite(self.transform).all() and a * e - b * d != 0.0):
             raise ValueError(f"the cells have no size: {self.transform}")
@@ -242,7 +242,7 @@ def as_number(value: Value) -> float | None:
         if not text or text.casefold() == "nan":
             return None
         if _DECIMAL.fullmatch(text) is None:
-            raise ValueError(f"{text[:40]!r} is no number")
+            raise ValueError(f"{text[:40]!r} is not a number")
         return float(text)
     return None if value is None or math.isnan(value) else float(value)
 
@@ -253,7 +253,7 @@ def read_bytes(path: Path) -> bytes:
         about = path.stat()
         if not stat.S_ISREG(about.st_mode):
             raise map_error(
-                path, "this is no regular file", fix="name the map's file", code="no-file"
+                path, "this is not a regular file", fix="name the map's file", code="no-file"
             )
         size_bytes = about.st_size
         if not size_bytes <= MAX_FILE_BYTES:
@@ -307,7 +307,7 @@ def check_coordinates(points: NDArray[np.float64]) -> None:
     Before any sum or product of coordinates, which could overflow.
     """
     if not (np.abs(points) <= COORDINATE_MAX).all():
-        raise ValueError("a coordinate is no finite number, or beyond a billion")
+        raise ValueError("a coordinate is not a finite number, or beyond a billion")
 
 
 def check_counts(path: Path, *, records: int, vertices: int) -> None:

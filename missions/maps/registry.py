@@ -200,7 +200,7 @@ def read_area(
         index, reason = next(iter(found.skipped.items()))
         raise map_error(
             path,
-            f"record {names[index]} is no area: {reason}",
+            f"record {names[index]} is not an area: {reason}",
             fix="draw it as a polygon",
             code="no-polygon",
         )
@@ -239,7 +239,7 @@ def read_records(path: Path, *, crs: str | None = None, layer: str | None = None
         if index not in marks:
             raise map_error(
                 path,
-                f"record {names[index]} is no area, point or line: {reason}",
+                f"record {names[index]} is not an area, point or line: {reason}",
                 fix="draw it anew, or delete the record",
                 code="no-polygon",
             )
@@ -310,12 +310,14 @@ def _read(
         usable = folder or path.is_file()
     except (OSError, ValueError) as error:
         raise map_error(
-            path, f"is no path ({error})", fix="check the path", code="no-file"
+            path, f"is not a path ({error})", fix="check the path", code="no-file"
         ) from None
     if not there:
         raise map_error(path, "there is no such file", fix="check the path", code="no-file")
     if not usable:
-        raise map_error(path, "this is no regular file", fix="name the map's file", code="no-file")
+        raise map_error(
+            path, "this is not a regular file", fix="name the map's file", code="no-file"
+        )
     suffix = path.suffix.casefold()
     reader = READERS.get(suffix)
     if folder or suffix == ".zip":

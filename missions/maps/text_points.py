@@ -51,7 +51,7 @@ class TangentPlane:
 
     def __post_init__(self) -> None:
         if not (abs(self.latitude_deg) <= 90.0 and abs(self.longitude_deg) <= 180.0):
-            raise ValueError(f"origin is no position: {self.latitude_deg}, {self.longitude_deg}")
+            raise ValueError(f"origin is not a position: {self.latitude_deg}, {self.longitude_deg}")
         if not math.isfinite(self.altitude_m):
             raise ValueError(f"origin has no altitude: {self.altitude_m}")
         forward = Transformer.from_pipeline(
@@ -162,7 +162,7 @@ def _lines(content: bytes, path: Path) -> list[tuple[int, str]]:
         text = "\0"
     if "\0" in text:
         raise map_error(
-            path, "this is no plain text", fix="save it as plain text in UTF-8", code="encoding"
+            path, "this is not plain text", fix="save it as plain text in UTF-8", code="encoding"
         )
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     return [(number, line) for number, line in enumerate(lines, 1) if line and not line.isspace()]
@@ -182,7 +182,7 @@ def _count(first: tuple[int, str], path: Path) -> int:
             raise _comma(path, *first)
         raise map_error(
             path,
-            f"line {first[0]} is {first[1].strip()[:40]!r}, so this is no open text map, which "
+            f"line {first[0]} is {first[1].strip()[:40]!r}, so this is not an open text map, which "
             "begins with the number of its points",
             fix="name another file, or see docs/howto/text-map.md for the format",
             code="unknown-format",
@@ -221,7 +221,10 @@ def _check_rows(rows: list[tuple[int, str]], path: Path, *, last: int) -> None:
         if wrong is not None or not np.isfinite([float(word) for word in words]).all():
             shown = wrong or line.strip()
             raise map_error(
-                path, f"line {number}: {shown[:40]!r} is no number", fix=_SEVERAL, code="bad-number"
+                path,
+                f"line {number}: {shown[:40]!r} is not a number",
+                fix=_SEVERAL,
+                code="bad-number",
             )
         if len(words) != 4:
             cut = number == last and len(words) < 4

@@ -189,7 +189,7 @@ def is_mass_per_area(unit: str) -> bool:
 
 
 def other_quantity(unit: str) -> str | None:
-    """Return what a known unit measures that is no volume per area and cannot become one.
+    """Return what a known unit measures that is not a volume per area and cannot become one.
 
     None for units that can, and for what is no unit that is known here.
 

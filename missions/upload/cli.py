@@ -217,7 +217,7 @@ def _number(value: object) -> float:
     if value is None:
         return math.nan
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"{value!r:.40} is no number")
+        raise ValueError(f"{value!r:.40} is not a number")
     return float(value)
 
 
@@ -231,9 +231,9 @@ def wire_item(command: int, frame: int, numbers: list[float], *, goes_on: bool =
     x, y, z = (0.0 if math.isnan(value) else value for value in numbers[4:7])
     scale = 1e7 if frame in SAME_FRAME else 1.0
     if frame in SAME_FRAME and not (abs(x) <= 90.0 and abs(y) <= 180.0):
-        raise ValueError(f"{x:g}, {y:g} is no place")
+        raise ValueError(f"{x:g}, {y:g} is not a place")
     if not (abs(x * scale) < 2**31 and abs(y * scale) < 2**31 and abs(z) < 1e6):
-        raise ValueError(f"{x:g}, {y:g}, {z:g} is no place")
+        raise ValueError(f"{x:g}, {y:g}, {z:g} is not a place")
     return WireItem(
         command=command, frame=frame, params=params, x=round(x * scale), y=round(y * scale), z_m=z,
         goes_on=goes_on,

@@ -131,7 +131,7 @@ def elsewhere(
     reach_m: float,
     whose: str,
 ) -> str | None:
-    """Return why this is no mission for a field, and what to do; None where it is one.
+    """Return why this is not a mission for a field, and what to do; None where it is one.
 
     A depot may lie far from its field. Some way from item to item leads over the field all the
     same, or so near that a boom which reaches `reach_m` to the side comes over it.

@@ -352,7 +352,9 @@ def _factor(entry: Mapping[str, Any], number: int) -> Factor:
         check_value(name, end)
     if "steps" in entry:
         steps = _whole(entry["steps"], f"{where}.steps", least=2)
-        return Factor(name, values=tuple(np.linspace(low, high, steps).tolist()))
+        # As they are written: 0.12, not 0.12000000000000001.
+        evenly = (float(f"{value:.12g}") for value in np.linspace(low, high, steps).tolist())
+        return Factor(name, values=tuple(evenly))
     return Factor(name, low=low, high=high)
 
 

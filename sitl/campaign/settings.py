@@ -142,7 +142,7 @@ def check_value(name: str, value: object) -> Value:
         elif isinstance(value, bool | int | float | str):
             return value
         else:
-            raise ConfigError(f"{name}: {value!r} is no value; write a number, text or list")
+            raise ConfigError(f"{name}: {value!r} is not a value; write a number, text or list")
     if kind.type is float:
         return _checked_number(name, value, kind)
     if not isinstance(value, kind.type):

@@ -3,7 +3,7 @@
     vrspray campaign examples/campaigns/validation.toml --out flown
     python -m sitl.studies.validation flown --out docs/measurements
 
-`validation_flights` reads the flights, `validation_page` and `validation_pictures` show.
+`validation_flights` reads the flights, `validation_pictures` shows them.
 """
 
 from __future__ import annotations

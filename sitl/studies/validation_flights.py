@@ -42,7 +42,7 @@ BOUND_METHODS = ("none", "look-ahead")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Way:
+class FlownMethod:
     """A method and the output it works through; `servo` is the board that restarts.
 
     P1's controller doses by its Eq. 2, or, to see what that costs, by its measured Table 2.
@@ -61,11 +61,14 @@ class Way:
 
 
 WAYS = (
-    *(Way(method=method) for method in P1_LOOK_AHEAD_S),
-    Way(method=SCHEDULED),
-    Way(method=SCHEDULED, output="servo"),
+    *(FlownMethod(method=method) for method in P1_LOOK_AHEAD_S),
+    FlownMethod(method=SCHEDULED),
+    FlownMethod(method=SCHEDULED, output="servo"),
 )
-LOOK_AHEAD, BY_TABLE = Way(method="look-ahead"), Way(method="look-ahead", by_table=True)
+LOOK_AHEAD, BY_TABLE = (
+    FlownMethod(method="look-ahead"),
+    FlownMethod(method="look-ahead", by_table=True),
+)
 # What is flown; the pictures show `WAYS`.
 EVERY_WAY = (*WAYS, BY_TABLE)
 
@@ -155,7 +158,7 @@ class Row:
     of all data points; `seed_accuracy_percent` the lowest and the highest of a flight.
     """
 
-    way: Way
+    way: FlownMethod
     speed_m_s: float
     flights: int
     settled: SettledLag
@@ -168,7 +171,7 @@ class Row:
     by_rate: tuple[RateAccuracy, ...]
 
     @staticmethod
-    def of(way: Way, speed_m_s: float, flights: list[Flown]) -> Row:
+    def of(way: FlownMethod, speed_m_s: float, flights: list[Flown]) -> Row:
         """Return the row of the flights of one method at one speed."""
         by_rate = pooled_by_rate(flown.by_rate for flown in flights)
         whole = pooled_percent(by_rate)
@@ -203,7 +206,7 @@ class Validation:
     seeds: tuple[int, ...]
     rows: tuple[Row, ...]
 
-    def row(self, way: Way, speed_m_s: float) -> Row:
+    def row(self, way: FlownMethod, speed_m_s: float) -> Row:
         """Return the row of a method and a speed."""
         return next(row for row in self.rows if (row.way, row.speed_m_s) == (way, speed_m_s))
 

@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from analysis.published import P1_RATES_L_HA, P1_SPRAYING_ACCURACY_PERCENT
 from companion.errors import ConfigError
 from sitl.demo_pictures import COLOURS, DPI, INK, QUIET, STYLE, TITLES, new_figure
-from sitl.studies.validation_flights import WAYS, Row, Validation, Way, basis, mean_of
+from sitl.studies.validation_flights import WAYS, FlownMethod, Row, Validation, basis, mean_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -73,11 +73,11 @@ def lag_figure(result: Validation) -> Figure:
     return figure
 
 
-def _colour(way: Way) -> str:
+def _colour(way: FlownMethod) -> str:
     return SERVO_COLOUR if way.output == "servo" else COLOURS[way.method]
 
 
-def _title(way: Way) -> str:
+def _title(way: FlownMethod) -> str:
     title = TITLES[way.method]
     return way.name if title == way.method and title != "none" else title
 

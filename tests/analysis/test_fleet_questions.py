@@ -111,8 +111,8 @@ def test_each_kind_of_flight_has_its_own_part_of_the_page(
     assert sections["real"]["metered_percent"] == 0.0  # no meter is none of the litres
     page = (out / "fleet.html").read_text()
     for text in (
-        "Real flights (2)", "Training with water, and dry (2)", "No product: water, and of dry",
-        "SIMULATED: nothing was sprayed", "their litres may not have been sprayed",
+        "Real flights (2)", "Training with water, and dry (2)", "No product was sprayed: water",
+        "SIMULATED: nothing was sprayed", "perhaps none of these litres were sprayed",
         "0 % of the litres metered",
     ):  # fmt: skip
         assert text in page, text
@@ -200,7 +200,7 @@ def test_memory_has_a_limit(fleet: Path, capsys: Captured) -> None:
         (("query", "SELECT 1", "--fleet", "gibberish://x"), "Protocol not known"),
         (("query", "SELECT 1", "--fleet", "{fleet}", "--out", "{tmp}/a.xlsx"), "no such format"),
         (("query", "SELECT 1", "--fleet", "{fleet}", "--out", "{tmp}/b/a.csv"), "not there"),
-        (("report", "--fleet", "{fleet}", "--out", "{tmp}", "--from", "May"), "is no month"),
+        (("report", "--fleet", "{fleet}", "--out", "{tmp}", "--from", "May"), "is not a month"),
         (("report", "--fleet", "{fleet}", "--out", "{tmp}", "--kind", "odd"), "no such kind"),
         (("serve", "--fleet", "{fleet}", "--tls-key", "{tmp}/k.pem"), "go together"),
     ],

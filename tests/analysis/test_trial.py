@@ -155,8 +155,8 @@ def test_a_plot_that_nobody_flew_over_fails_unless_it_gets_nothing(strips: list[
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("{}", "this is no trial"),
-        ("[1]", "this is no trial"),
+        ("{}", "this is not a trial"),
+        ("[1]", "this is not a trial"),
         (json.dumps({"trial": {"version": 9}, "features": []}), "version 9"),
         (json.dumps({"trial": {"version": 1}, "features": []}), "no plots"),
     ],

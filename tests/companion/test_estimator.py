@@ -183,7 +183,7 @@ def test_an_autopilot_that_was_restarted_is_confirmed_anew() -> None:
         track = heard(position(13.0 + i / 10, 15.0 + i / 2, boot_s=0.5 + i / 10), track=track)
         state = estimate(track, 13.0 + i / 10)
         assert state is not None
-        # After three it is no copy, and five have to confirm the first of them.
+        # After three it is not a copy, and five have to confirm the first of them.
         assert state.position_valid == (i < 2 or i == 7)
         assert state.east_m == pytest.approx(15.0 + i / 2, abs=0.01)
 

@@ -98,7 +98,7 @@ def test_any_content_with_the_right_hash_is_read_or_refused(
     originals: list[Path],
     folder: Path,
 ) -> None:
-    """Whoever changes a value can work out the hash anew: it is no signature."""
+    """Whoever changes a value can work out the hash anew: it is not a signature."""
     path = folder / "changed.flightmap.gpkg"
     path.write_bytes(originals[which].read_bytes())
     with closing(sqlite3.connect(path, isolation_level=None)) as connection:

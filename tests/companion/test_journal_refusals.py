@@ -89,9 +89,9 @@ SETUP = "UPDATE meta SET value = {} WHERE key = 'setup'"
 NO_JOURNAL: dict[str, tuple[Damage, str]] = {
     "no file": (Path.unlink, "there is no such file; give the .gpkg file of a flight"),
     "a folder": (as_folder, "is a folder; give the .gpkg file of a flight"),
-    "a text": (lambda path: path.write_text("a text\n" * 99), "is no journal"),
-    "empty": (lambda path: path.write_bytes(b""), "is no journal"),
-    "other database": (other_database("CREATE TABLE meta (key, value)"), "is no journal"),
+    "a text": (lambda path: path.write_text("a text\n" * 99), "is not a journal"),
+    "empty": (lambda path: path.write_bytes(b""), "is not a journal"),
+    "other database": (other_database("CREATE TABLE meta (key, value)"), "is not a journal"),
     "other geopackage": (
         other_database("PRAGMA application_id = 1196444487", "CREATE TABLE zones (geom)"),
         "is a GeoPackage, but no journal of a flight",
@@ -120,7 +120,10 @@ DAMAGED: dict[str, tuple[Damage, str]] = {
         " rows, 122 were written",
     ),
     "no count": (sql("DELETE FROM meta WHERE key = 'lost'"), "the flight said of lost is missing"),
-    "count": (sql("UPDATE meta SET value = 'x' WHERE key = 'lost'"), "said of lost is no number"),
+    "count": (
+        sql("UPDATE meta SET value = 'x' WHERE key = 'lost'"),
+        "said of lost is not a number",
+    ),
     **{
         f"no table {table}": (sql(f"DROP TABLE {table}"), said)
         for table, said in {

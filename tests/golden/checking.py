@@ -224,7 +224,7 @@ def difference(
         ]
     else:
         is_known = isinstance(was, Enum | str | int | frozenset | tuple) or was is None
-        assert is_known, f"{name}: {type(was).__name__} is no value of the core"
+        assert is_known, f"{name}: {type(was).__name__} is not a value of the core"
         return None if was == now else f"{name} was {was!r}, is {now!r}"
     each = (difference(*one, is_tolerant=is_tolerant, within=within) for one in pairs)
     return next((found for found in each if found), None)

@@ -305,12 +305,12 @@ def test_units_are_taken_from_their_columns(folder: Path) -> None:
         ("lat,lon,rate\n3986000,280000,5\n", "out-of-range", "line 2"),
         ("lat,lon,rate\n", "truncated", "no rows"),
         ("", "no-coordinates", "the file is empty"),
-        ("36.0,114.5,5\n36.0,114.6,5\n", "no-coordinates", "is no header"),
+        ("36.0,114.5,5\n36.0,114.6,5\n", "no-coordinates", "is not a header"),
         ("plot,rate\n1,5\n", "no-coordinates", "plot, rate"),
         ("lat,latitude,rate\n1,5,6\n", "no-coordinates", "no columns say where"),
         ("lat,lon,rate,rate\n36.0,114.5,5,6\n", "duplicate-column", "rate is there 2 times"),
         (square("lat,lon,crop", "a", "b", "c", "d"), "no-rate-column", "no column"),
-        ('lat,lon,rate\n36.0,114.5,"5\n', "truncated", "no whole CSV file"),
+        ('lat,lon,rate\n36.0,114.5,"5\n', "truncated", "not a whole CSV file"),
         ("lat,lon,rate" + ",a" * 300 + "\n", "too-large", "303 columns"),
     ],
 )
@@ -331,7 +331,7 @@ def test_one_bad_cell_among_numbers_is_named(folder: Path, cell: str, header: st
         read_csv(write(folder, text))
     name = header.split(",")[2]
     assert caught.value.code == "bad-number"
-    assert f"line 4: {name} is {cell!r}, which is no number" in str(caught.value)
+    assert f"line 4: {name} is {cell!r}, which is not a number" in str(caught.value)
 
 
 def test_one_bad_cell_beside_polygons_is_named(folder: Path) -> None:

@@ -144,7 +144,7 @@ def test_a_file_with_two_units_is_refused() -> None:
 
 
 def test_a_unit_that_nobody_understands_yields_to_the_operator() -> None:
-    with pytest.raises(MapError, match="'Liter' is no volume per area"):
+    with pytest.raises(MapError, match="'Liter' is not a volume per area"):
         unit(column("unit", "Liter", "Liter"))
     assert unit(column("unit", "Liter", "Liter"), asked="L/ha") == "L/ha"
 

@@ -225,7 +225,7 @@ def test_a_rate_of_nan_is_no_rate(tmp_path: Path) -> None:
 
 
 def test_a_decimal_comma_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(MapError, match="dose of zone 1 is '7,5', which is no rate"):
+    with pytest.raises(MapError, match="dose of zone 1 is '7,5', which is not a rate"):
         read_map(saved(tmp_path, collection(feature("7,5"))), rate_field="dose")
 
 
@@ -235,7 +235,7 @@ def test_a_coordinate_that_is_no_number_is_called_so(
     tmp_path: Path, value: float, vertex: int
 ) -> None:
     ring = [[value, SOUTH] if index == vertex else xy for index, xy in enumerate(SQUARE)]
-    with pytest.raises(MapError, match="a coordinate is no finite number"):
+    with pytest.raises(MapError, match="a coordinate is not a finite number"):
         read_map(saved(tmp_path, collection(feature(1, ring))))
 
 
@@ -308,7 +308,7 @@ def test_text_that_is_not_in_utf_8_is_refused(tmp_path: Path) -> None:
 def test_what_is_no_text_is_not_to_be_saved_in_another_coding(tmp_path: Path) -> None:
     path = tmp_path / "field.geojson"
     path.write_bytes(bytes(range(256)))
-    with pytest.raises(MapError, match="no text, so it cannot be GeoJSON; export the map again"):
+    with pytest.raises(MapError, match="not text, so it cannot be GeoJSON; export the map again"):
         read_geojson(path)
 
 

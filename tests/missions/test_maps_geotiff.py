@@ -239,7 +239,7 @@ def test_an_alpha_band_hides_cells_and_is_no_product(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.isnan(grid.bands[0].values), alpha == 0)
 
 
-# --- What is no rate ---
+# --- What is not a rate ---
 
 
 def test_numbers_of_zones_are_taken_with_a_warning(tmp_path: Path) -> None:

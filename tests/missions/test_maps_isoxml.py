@@ -349,7 +349,7 @@ def test_lists_of_tasks_name_product_and_unit(tmp_path: Path) -> None:
     assert error.fix.endswith("--layer TSK2")
 
 
-# Each family of rates in ISO 11783-11 that is no volume per area and cannot become one, by its
+# Each family of rates in ISO 11783-11 that is not a volume per area and cannot become one, by its
 # setpoint: count and spacing, shares, weight and count per time, volume per length.
 @pytest.mark.parametrize("ddi", ["000B", "0010", "0015", "001A", "001F", "0029", "002E", "0279"])
 def test_no_unit_makes_litres_of_seeds_and_shares(tmp_path: Path, ddi: str) -> None:

@@ -528,7 +528,7 @@ def test_an_exclusion_that_would_lose_ground_is_refused(tmp_path: Path) -> None:
     with pytest.raises(MapError, match="rings cross themselves"):
         read_area(crossed)
     partly = write(tmp_path / "null.shp", [cell(0), None], geometry_type="Polygon", n=[1, 2])
-    with pytest.raises(MapError, match="record 2 is no area: null-geometry"):
+    with pytest.raises(MapError, match="record 2 is not an area: null-geometry"):
         read_area(partly)
 
 
@@ -1112,7 +1112,7 @@ def test_degrees_of_wgs84_need_no_word(tmp_path: Path, prj: str, crs: str) -> No
 def test_a_prj_that_is_of_no_map_is_refused(tmp_path: Path, prj: str) -> None:
     path = simple(tmp_path)
     path.with_suffix(".prj").write_text(prj)
-    with pytest.raises(MapError, match="no usable coordinate reference system") as caught:
+    with pytest.raises(MapError, match="not a usable coordinate reference system") as caught:
         read_map(path)
     assert caught.value.code == "wrong-crs"
 

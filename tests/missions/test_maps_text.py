@@ -235,7 +235,7 @@ def row(latitude: str = "39.5000000", longitude: str = "-0.4", rest: str = "5.0\
         (row(rest="5.0\t10,5"), "decimal-comma", "line 2"),
         ("11,243\n", "decimal-comma", "line 1"),
         ("2\n39.5,-0.4,5,10\n39.6,-0.4,5,10\n", "bad-number", "line 2"),
-        (row(rest="5.0\tten"), "bad-number", "line 2: 'ten' is no number"),
+        (row(rest="5.0\tten"), "bad-number", "line 2: 'ten' is not a number"),
         (row(rest="5.0\tnan"), "bad-number", "line 2: 'nan'"),
         (row(rest="5.0\tinf"), "bad-number", "line 2: 'inf'"),
         (row(rest="5.0\t1e999"), "bad-number", "line 2"),
@@ -252,8 +252,8 @@ def row(latitude: str = "39.5000000", longitude: str = "-0.4", rest: str = "5.0\
         (row("45.0", "190.0"), "out-of-range", "no longitude"),
         (row(rest="-9999\t10"), "out-of-range", "altitude"),
         (row(rest="5.0\t-1"), "bad-rate", "the rate is none"),
-        ("lat lon alt rate\n1 2 3 4\n", "unknown-format", "no open text map"),
-        ("Dear grower,\n", "unknown-format", "no open text map"),
+        ("lat lon alt rate\n1 2 3 4\n", "unknown-format", "not an open text map"),
+        ("Dear grower,\n", "unknown-format", "not an open text map"),
     ],
 )
 def test_refused_with_its_line(text: str, code: str, says: str) -> None:

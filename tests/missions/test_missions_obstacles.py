@@ -175,7 +175,7 @@ def test_a_broken_point_is_no_obstacle_and_is_refused(tmp_path: Path, coordinate
     feature = {"type": "Feature", "properties": {"radius_m": 3},
                "geometry": {"type": "Point", "coordinates": coordinates}}  # fmt: skip
     file.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
-    with pytest.raises(MapError, match="record 1 is no area, point or line"):
+    with pytest.raises(MapError, match="record 1 is not an area, point or line"):
         read_obstacles(file, frame_of(to_degrees(FIELD)))
 
 

@@ -96,6 +96,18 @@ def test_the_companion_names_no_module_of_the_office_in_a_string_either() -> Non
         and isinstance(node.value, str)
         and named.fullmatch(node.value)
     ]
+    found += [
+        f"{relative(path)}:{node.lineno}: {ast.unparse(node)}"
+        for path in (ROOT / "companion").rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call)
+        and ast.unparse(node.func).rpartition(".")[2]
+        in ("find_spec", "import_module", "__import__")
+        and any(
+            isinstance(given, ast.Constant) and given.value in ("missions", "analysis", "sitl")
+            for given in node.args
+        )
+    ]
     assert found == []
 
 

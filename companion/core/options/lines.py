@@ -84,7 +84,7 @@ class Lines:
         if not 0.0 < self.course_deg <= 90.0:
             raise ValueError(f"course_deg must lie in (0, 90], got {self.course_deg}")
         if not all(math.isfinite(x) for line in self.polylines for place in line for x in place):
-            raise ValueError("a line with a place that is no number")
+            raise ValueError("a line with a place that is not a number")
         pieces = _pieces(self.polylines, math.cos(math.radians(self.course_deg)))
         if not pieces:
             raise ValueError("no line of any length")
@@ -159,7 +159,7 @@ def _ways(state: VehicleState) -> tuple[MissionLeg, ...] | None:
     """Return the leg that is flown, and the one before while the vehicle still flies its way.
 
     Autopilots go on to the next item some metres before the end of a leg: a leg that the vehicle
-    flies against is not flown yet, and a ferry that ends at the far end of a line is no line. None
+    flies against is not flown yet, and a ferry that ends at the far end of a line is none. None
     of the legs where it is not known which; None where it is not the mission that is flown.
     """
     way, before = state.mission_leg, state.mission_leg_before

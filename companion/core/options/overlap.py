@@ -143,7 +143,7 @@ def _along(
     for chord in range(chords):
         t0, t1 = paths.time_s[chord], paths.time_s[chord + 1]
         v0, v1 = paths.speed_m_s[:, chord, None], paths.speed_m_s[:, chord + 1, None]
-        # Speed changes evenly along a chord, as in `paths.time_on_chord`.
+        # Speed changes evenly along a chord, as in `boom.time_on_chord`.
         pace = np.sqrt(np.maximum(v0 * v0 + (v1 * v1 - v0 * v0) * shares, 0.0))
         times.append(t0 + shares * (v0 + v1) / np.maximum(v0 + pace, 1e-9) * (t1 - t0))
         right_east, right_north = paths.right[chord]

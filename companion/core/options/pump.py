@@ -3,7 +3,7 @@
 A pump that makes the flow (`modulates`) is one more valve to the laws of the schedule: its route is
 that of the whole boom, its duty the motor's fraction, its lags are its own. The valves, where
 there are any, are on-off sections then. Whatever the laws say, the last word has
-`drive_plans.behind_path`: the pump never runs while there is no way out for what it pumps.
+`behind_path`: the pump never runs while there is no way out for what it pumps.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ def swept(
     flow_edges: tuple[FlowEdge, ...],
 ) -> list[Quad]:
     """Return the quadrilaterals swept on the way through `poses`; `is_open` holds at the first."""
-    way = _Way(boom, poses)
+    way = _BoomPath(boom, poses)
     stays = _stays(is_open, flow_edges, poses[0].time_s, poses[-1].time_s)
     return [quad for strip in _strips(boom, stays) for quad in way.quads(*strip)]
 
@@ -99,7 +99,7 @@ def _strips(boom: Boom, stays: list[_Stays]) -> list[_Strip]:
     return found
 
 
-class _Way:
+class _BoomPath:
     """The way of the boom through its poses, in as few straight pieces as it allows.
 
     Plain numbers: for some ten poses that is several times as fast as arrays are.

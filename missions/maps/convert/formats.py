@@ -288,7 +288,7 @@ def _check_target(path: Path, *, force: bool) -> None:
         parent = path.parent.is_dir()
         full = folder and any(path.iterdir())
     except (OSError, ValueError) as error:
-        raise map_error(path, f"is no path ({error})", fix="check it", code="no-file") from None
+        raise map_error(path, f"is not a path ({error})", fix="check it", code="no-file") from None
     if not parent:
         raise map_error(
             path, "its folder is not there", fix="make the folder first", code="no-file"

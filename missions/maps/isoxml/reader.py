@@ -92,7 +92,7 @@ class TaskFiles:
         if not _FILE_NAME.fullmatch(stem):
             raise map_error(
                 self.path,
-                f"it refers to a file {name[:40]!r}, which is no name of a task file",
+                f"it refers to a file {name[:40]!r}, which is not a name of a task file",
                 fix=EXPORT_AGAIN,
                 code="bad-attribute",
             )

@@ -353,7 +353,7 @@ def task_list(tasks: Sequence[TaskContents]) -> str:
 
 
 def instead_of(chosen: str, tasks: Sequence[TaskContents]) -> str:
-    """Return what to choose where a product of the chosen task is no volume per area."""
+    """Return what to choose where a product of the chosen task is not a volume per area."""
     own = [one for task in tasks if task.id == chosen for one in task.sprayable]
     if own:
         return f"take with --rate-field (prescription.rate_field): {_listed(own)}"

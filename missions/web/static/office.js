@@ -226,7 +226,7 @@ async function edit() {
   const data = await ask(`office/given/${encodeURIComponent(byId("field").value)}`).catch(() => null);
   const shape = data?.features?.[0]?.geometry ?? data?.geometry ?? data;
   const ring = shape?.type === "Polygon" ? shape.coordinates[0] : shape?.type === "MultiPolygon" ? shape.coordinates[0][0] : null;
-  if (!ring || ring.length > 400) { say("This boundary cannot be edited here: it is no polygon, or has over 400 corners.", true); return; }
+  if (!ring || ring.length > 400) { say("This boundary cannot be edited here: it is not a polygon, or has over 400 corners.", true); return; }
   startDrawing("boundary", ring.slice(0, -1).map(([lng, lat]) => [lng, lat]));
 }
 

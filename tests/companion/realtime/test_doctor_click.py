@@ -81,7 +81,7 @@ async def test_ctrl_c_between_the_valves_ends_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--click",), "stdin is no terminal"),
+        (("--click",), "stdin is not a terminal"),
         (("--click", "--set", "output.kind=none"), "there are no valves to click"),
         (("--click", "--wet"), "needs a flow meter"),
     ],

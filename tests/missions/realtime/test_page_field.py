@@ -230,7 +230,7 @@ class Day:
         await page.get_by_label("Inversion").select_option("no")
         await page.get_by_role("button", name="Declare").click()
         await expect(page.locator("#answer")).to_contain_text("allowed is at most 25 deg C")
-        await expect(page.locator("#alarms")).to_contain_text("Temperature not by label")
+        await expect(page.locator("#alarms")).to_contain_text("Temperature outside label")
         await page.get_by_label("Temperature, °C").fill("19.5")
         await page.get_by_role("button", name="Declare").click()
         await expect(page.locator("#answer")).to_contain_text("declared, and kept")
