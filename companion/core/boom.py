@@ -229,7 +229,11 @@ def turning_of(state: VehicleState) -> Turning:
 
 
 def speed_shares(state: VehicleState, boom: Boom, dt_s: float) -> list[float]:
-    """Return how fast each valve goes `dt_s` from now, beside the position reference."""
+    """Return how fast each valve goes `dt_s` from now, beside the position reference.
+
+    0 for one that the turn carries back over ground that it has just left: the boom pivots, and
+    nothing that falls then falls on a pass.
+    """
     now = turning_of(state)
     # What fades is never faster later on; mostly the nose stands.
     if not now.fastest_deg_s > STEADY_YAW_RATE_DEG_S:
@@ -241,11 +245,10 @@ def speed_shares(state: VehicleState, boom: Boom, dt_s: float) -> list[float]:
     east, north, _, _ = _carried(state, dt_s, ae, an)
     angle = math.radians((state.heading_deg or 0.0) + turned_deg)
     sin, cos, rate = math.sin(angle), math.cos(angle), math.radians(yaw.rate_deg_s)
-    pace = np.hypot(
-        east + rate * (boom.forward_m * cos - boom.right_m * sin),
-        north - rate * (boom.right_m * cos + boom.forward_m * sin),
-    )
-    found: list[float] = (pace / max(math.hypot(east, north), 1e-3)).tolist()
+    own_east = east + rate * (boom.forward_m * cos - boom.right_m * sin)
+    own_north = north - rate * (boom.right_m * cos + boom.forward_m * sin)
+    pace = np.hypot(own_east, own_north) / max(math.hypot(east, north), 1e-3)
+    found: list[float] = np.where(own_east * east + own_north * north > 0.0, pace, 0.0).tolist()
     return found
 
 

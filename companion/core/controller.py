@@ -15,7 +15,15 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, NamedTuple
 
 from companion.core.boom import Intervals, Paths, speed_shares
-from companion.core.crossings import NO_ROUTES, KnownRoutes, Route, carried_on, find_routes, rate_at
+from companion.core.crossings import (
+    NO_ROUTES,
+    Crossing,
+    KnownRoutes,
+    Route,
+    carried_on,
+    find_routes,
+    rate_at,
+)
 from companion.core.frame import Offset
 from companion.core.nozzle import (
     NozzleSet,
@@ -359,7 +367,6 @@ def _orders(
 
     dosing = dosing_by_valve(nozzle_sets, index, set_of_rate, dose)
     soon_m_s = speed_soon(setup, state, speed_m_s)
-    shares = speed_shares(state, setup.boom, acts_after_s(setup))
     overdrive = overdrive_of(setup, index)
     sticky_s = sticky_border_s(setup.border_buffer_m, speed_m_s)
     until_s = now_s + setup.lease_s
@@ -370,6 +377,7 @@ def _orders(
         own_routes, is_early = sections(
             setup.pumping, routes, ran_s=ran_s, was_early=before.is_early, now_s=now_s
         )
+    own_routes, shares = _in_turn(setup, state, own_routes, in_force, now_s)
     valves: list[ValveSchedule] = []
     alike: dict[tuple[float | None, float, float, Dosing], ValveSchedule] = {}
     for valve, (route, own) in enumerate(zip(own_routes, shares, strict=True)):
@@ -400,6 +408,30 @@ def _orders(
         valves.append(made)
     gain = 1.0 if trim is None else trim.sets[index].trim
     return Orders(valves, Ordering(index, set_of_rate, trim, is_early), speed_m_s, skew, gain)
+
+
+def _in_turn(
+    setup: Setup,
+    state: VehicleState,
+    routes: tuple[Route, ...],
+    in_force: tuple[float, ...],
+    now_s: float,
+) -> tuple[tuple[Route, ...], list[float]]:
+    """Return the routes, and how fast each valve goes beside the boom when its orders act.
+
+    A valve that the turn carries backwards closes. At the end of a pass, where the boom begins to
+    swing about one end, nothing opens once more.
+    """
+    shares = speed_shares(state, setup.boom, acts_after_s(setup))
+    if min(shares) > 0.0:
+        return routes, shares
+    swings = state.yaw_rate_deg_s * state.yaw_gain_deg_s2 > 0.0
+    closed: Route = (Crossing(now_s, None, False, 0.0),)
+    held = [
+        closed if not own > 0.0 or (swings and duty == 0.0) else route
+        for route, own, duty in zip(routes, shares, in_force, strict=True)
+    ]
+    return tuple(held), shares
 
 
 def _trim(

@@ -445,7 +445,7 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
     if motion is None:
         return None
     dt_s = now_s - motion.time_s
-    nose_deg, (turned_deg, yaw) = motion.heading_deg, motion.yaw.after(dt_s)
+    nose_deg, (turned_deg, yaw) = motion.heading_deg, motion.yaw.ending.after(dt_s)
     east, north = _after(track.inertia, motion, dt_s)
     velocity_east, velocity_north = east.velocity_m_s, north.velocity_m_s
     checked, known = _checked_speed(track, now_s), motion.velocity_known

@@ -74,8 +74,7 @@ GAIN_STEP_S = 0.005
 # of the rate 0.3 s ahead 11 deg/s are wrong (rms), 19 without the acceleration.
 YAW_TIME_S = 0.07
 YAW_FADE_S = 0.3
-# No multicopter turns faster.
-YAW_RATE_MAX_DEG_S = 360.0
+YAW_RATE_MAX_DEG_S = 360.0  # no multicopter turns faster
 # So many rounds stand for thousands of messages; most are there sooner.
 DOUBLINGS = 14
 SETTLED = 1e-12
@@ -565,6 +564,14 @@ class Turning(NamedTuple):
         return turned_deg, Turning(rate_deg_s, self.gain_deg_s2 * over.kept)
 
     @property
+    def ending(self) -> Turning:
+        """Return the turn as it is foretold: one that slows down ends, and does not turn back."""
+        if not self.rate_deg_s * self.gain_deg_s2 < 0.0:
+            return self
+        most = abs(self.rate_deg_s) / YAW_FADE_S
+        return Turning(self.rate_deg_s, min(max(self.gain_deg_s2, -most), most))
+
+    @property
     def fastest_deg_s(self) -> float:
         """Return the fastest of now and later, without sign."""
         return max(abs(self.rate_deg_s), abs(self.rate_deg_s + self.gain_deg_s2 * YAW_FADE_S))
@@ -577,11 +584,11 @@ def turning(
     before: Turning, before_deg: float | None, heading_deg: float | None, dt_s: float
 ) -> Turning:
     """Return how the nose turns after one more heading."""
-    if heading_deg is None or before_deg is None:
-        return STEADY
-    if not abs(heading_deg - before_deg) <= 720.0:
-        return STEADY  # one of them is not a number; the rate would never be one again
+    if heading_deg is None or before_deg is None or not abs(heading_deg - before_deg) <= 720.0:
+        return STEADY  # of what is not a number the rate would never be one again
     turned_deg = (heading_deg - before_deg + 180.0) % 360.0 - 180.0
+    # What is divided by it twice must not know what our clock shows.
+    dt_s = max(round(dt_s, 6), 1e-6)
     foretold_deg, now = before.after(dt_s)
     # Both are means over the time between the two headings.
     off_deg_s = (turned_deg - foretold_deg) / dt_s

@@ -17,6 +17,7 @@ from companion.core.boom import (
     speed_shares,
     turning_of,
 )
+from companion.core.controller import Memory, step
 from companion.core.crossings import find_routes
 from companion.core.estimator import Track, estimate, observe
 from companion.core.motion import (
@@ -190,6 +191,7 @@ def test_a_valve_is_dosed_by_the_speed_that_it_has_then(
     nose = math.radians(heading_deg + turned_deg)
     spin = math.radians(then_deg_s)
     shares = speed_shares(state, BOOM, ahead_s)
+    ahead = state.velocity_east_m_s, state.velocity_north_m_s
     if max(abs(then_deg_s), abs(last_deg_s)) <= STEADY_YAW_RATE_DEG_S:
         assert shares == [1.0] * 6
         return
@@ -197,10 +199,31 @@ def test_a_valve_is_dosed_by_the_speed_that_it_has_then(
         # Clockwise from north: what is ahead goes to the right, what is right goes back.
         east = valve.right_m * math.cos(nose) + valve.forward_m * math.sin(nose)
         north = valve.forward_m * math.cos(nose) - valve.right_m * math.sin(nose)
-        own = math.hypot(
-            state.velocity_east_m_s + spin * north, state.velocity_north_m_s - spin * east
-        )
-        assert share * speed_m_s == pytest.approx(own, abs=0.01)
+        own = ahead[0] + spin * north, ahead[1] - spin * east
+        forward = own[0] * ahead[0] + own[1] * ahead[1]
+        if abs(forward) > 0.1:  # 0 of one that goes back
+            wanted = math.hypot(*own) if forward > 0.0 else 0.0
+            assert share * speed_m_s == pytest.approx(wanted, abs=0.01)
+
+
+@pytest.mark.parametrize(("gain_deg_s2", "opens"), [(40.0, False), (-40.0, True)])
+def test_a_boom_that_swings_at_the_end_of_a_pass_opens_nothing_once_more(
+    gain_deg_s2: float, opens: bool
+) -> None:
+    # 1 m/s, and 50 degrees a second to the right: the right half goes back.
+    state = flying(
+        10.0, 24.0, 0.0, velocity_east_m_s=1.2, checked_speed_m_s=1.2, yaw_rate_deg_s=50.0,
+        yaw_gain_deg_s2=gain_deg_s2,
+    )  # fmt: skip
+    wide = Prescription(
+        [Zone(name="a", polygon=shapely.box(-90, -90, 99, 99), rate_l_ha=20.0)],
+        boundary=shapely.box(-95, -95, 100, 100),
+    )
+    decision, _ = step(setup(prescription=wide), state, Memory(), 10.0)
+    duty = decision.plan.duty_at(10.0)
+    assert not decision.inhibits
+    assert duty[5] == 0.0
+    assert (duty[0] > 0.0) is opens
 
 
 def test_a_heading_that_is_no_number_or_jumps_leaves_no_turn_beyond_what_can_be() -> None:
@@ -210,3 +233,23 @@ def test_a_heading_that_is_no_number_or_jumps_leaves_no_turn_beyond_what_can_be(
         found = turning(STEADY, 0.0, heading_deg, 0.02)
         assert abs(found.rate_deg_s) <= YAW_RATE_MAX_DEG_S
         assert math.isfinite(found.gain_deg_s2)
+
+
+@pytest.mark.parametrize("gain_deg_s2", [40.0, -40.0])
+def test_of_an_open_boom_only_the_valves_that_go_back_close(gain_deg_s2: float) -> None:
+    wide = setup(
+        prescription=Prescription(
+            [Zone(name="a", polygon=shapely.box(-90, -90, 99, 99), rate_l_ha=20.0)],
+            boundary=shapely.box(-95, -95, 100, 100),
+        )
+    )
+    slow = {"velocity_east_m_s": 1.2, "checked_speed_m_s": 1.2}
+    before, memory = step(wide, flying(10.0, 24.0, 0.0, **slow), Memory(), 10.0)
+    assert all(duty > 0.0 for duty in before.plan.duty_at(10.01))
+    turned = flying(
+        10.05, 24.06, 0.0, yaw_rate_deg_s=50.0, yaw_gain_deg_s2=gain_deg_s2, **slow
+    )  # fmt: skip
+    decision, _ = step(wide, turned, memory, 10.05)
+    duty = decision.plan.duty_at(10.051)
+    assert duty[0] > 0.0
+    assert duty[5] == 0.0

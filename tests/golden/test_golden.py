@@ -181,5 +181,5 @@ def test_values_are_the_same_only_where_they_are(
 
 
 def test_what_is_no_value_of_the_core_is_not_compared() -> None:
-    with pytest.raises(AssertionError, match="no value of the core"):
+    with pytest.raises(AssertionError, match="not a value of the core"):
         difference([setup()], [setup()], "setups")
