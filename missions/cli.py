@@ -35,7 +35,7 @@ from missions.mix import mix_lines, mix_of, with_tank
 from missions.picture import check_picture, draw_plan
 from missions.plan import LEAVE_PERCENT, Plan
 from missions.planner import plan_mission
-from missions.prices import closing_hint, overlap_warnings, prices
+from missions.prices import closing_hint, lines_warnings, overlap_warnings, prices
 from missions.reading import Asked, assumed, names_of, read_task
 from missions.reading_fleet import BreakAsked
 from missions.reading_ground import Autopilot, GroundAsked, label_warnings, parse_run_in, parse_wind
@@ -273,7 +273,12 @@ def plan(
     by_label = label_warnings(reading.config, flown_s, datetime.now(tz=UTC).timestamp())
     planned = replace(
         planned,
-        warnings=(*task.said, *by_label, *planned.warnings),
+        warnings=(
+            *task.said,
+            *by_label,
+            *planned.warnings,
+            *lines_warnings(planned, reading.config),
+        ),
         wind=task.wind,
         settings=with_tank(planned.settings, in_tank_l),
     )

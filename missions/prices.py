@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+from companion.config import Config
 from missions.demand import Rates
 from missions.errors import PlanError
 from missions.layouts import is_small
@@ -15,6 +16,8 @@ from missions.surroundings import NOTHING_AROUND, Surroundings
 
 # What is offered where nothing is asked for: 1 % of the ground, 5 % of the litres.
 LEAVE_MAX_PERCENT, OVERLAP_MAX_PERCENT = 1.0, 5.0
+# Ground under two passes is worth a word from this part of what is covered on.
+TWICE_SHARE = 0.02
 # A smaller gain is not worth a line of text.
 LEAST_S, LEAST_L_PERCENT = 6.0, 1.0
 
@@ -67,6 +70,20 @@ def overlap_warnings(plan: Plan, overlap_litres_percent: float) -> tuple[str, ..
             if closing
             else "allow more to be left with --leave-max"
         ),
+    )
+
+
+def lines_warnings(plan: Plan, config: Config | None) -> tuple[str, ...]:
+    """Return that the litres count on lines that the configuration does not name, where they do."""
+    closes = plan.settings.switch_off_percent is not None and plan.settings.valves
+    share = plan.coverage.overlap_percent / max(plan.coverage.percent, 1.0)
+    mission = None if config is None else config.mission
+    if mission is None or mission.lines is not None or not closes or not share > TWICE_SHARE:
+        return ()
+    more_l = share * plan.volume_l
+    return (
+        "the litres count on valves that close over ground sprayed before, which they do only with "
+        f"mission.lines set; without it up to {more_l:.1f} L more fall, and the tank may run empty",
     )
 
 

@@ -262,7 +262,7 @@ def crawl_warnings(
         f"{math.ceil(slow_m)} m of passes are short and turn into each other: flown at "
         f"{slow_m / seconds:.1f} m/s on average, where the nozzle sets give {over:.0f} % too much "
         f"({low:.2f} L/min at least), or nothing below safety.speed_min_m_s; slowest near "
-        f"{latitude_deg:.6f}, {longitude_deg:.6f}; draw the border there with fewer corners, or "
+        f"{latitude_deg:.6f}, {longitude_deg:.6f}; draw border or obstacle with fewer corners, or "
         f"try --leave-max 5",
     )
 

@@ -12,7 +12,6 @@ import shapely
 from shapely import Point
 from shapely.geometry.base import BaseGeometry
 
-from companion.wording import counted
 from missions.errors import PlanError
 from missions.field import Field
 from missions.free_space import FreeSpace, free_space
@@ -268,7 +267,8 @@ def far_warnings(
         ferry_min = (most.legs[0].seconds + most.legs[-1].seconds) / 60.0
         text = (
             f"depot {number} lies {far_m / 1000.0:.1f} km from the field: the ferries there and "
-            f"back take {ferry_min:.0f} min of each of its {counted(len(own), 'sortie')}"
+            f"back take {ferry_min:.0f} min of "
+            + ("its sortie" if len(own) == 1 else f"each of its {len(own)} sorties")
         )
         if not has_battery:
             text += "; give mission.battery_wh and power_hover_w, or nobody looks whether it lasts"

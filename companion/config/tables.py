@@ -229,7 +229,9 @@ class SwathTable(Table):
 class MissionTable(Table):
     """What planning needs, and which lines of a plan are sprayed."""
 
-    swath_width_m: Width = Field(description="spacing of passes; within 2 % of boom.width_m")
+    swath_width_m: Width = Field(
+        ge=0.3, description="spacing of passes; within 2 % of boom.width_m"
+    )
     speed_m_s: float = Field(ge=0.5, le=50, description="in the passes")
     height_m: float = Field(default=3.5, ge=0.5, le=120, description="in the passes")
     acceleration_m_s2: float = Field(default=2.5, gt=0, le=20, description="of the vehicle")

@@ -86,12 +86,16 @@ def test_without_a_map_one_rate_holds(capsys: pytest.CaptureFixture[str], tmp_pa
     assert found["volume_l"] == pytest.approx(found["spray_m"] * 6.0 / 1000.0)
 
 
+# The litres count on what valves that know the lines keep dry.
+NAMED = ("--set", 'mission.lines="m.lines.geojson"')
+
+
 def test_lines_are_flown_no_faster_than_the_sprayer_keeps_up(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     code, found, _ = run(
         capsys, ANYANG / "boundary.geojson", "--config", ANYANG / "config.toml",
-        "--speed-m-s", "11", "--out", tmp_path / "m.plan",
+        "--speed-m-s", "11", *NAMED, "--out", tmp_path / "m.plan",
     )  # fmt: skip
     assert code == 0
     assert found["warnings"] == []
@@ -106,7 +110,7 @@ def test_rates_beyond_the_sprayer_are_warned_of_with_a_place(
 ) -> None:
     code, found, err = run(
         capsys, ANYANG / "boundary.geojson", "--config", ANYANG / "config.toml",
-        "--rate-l-ha", "300", "--out", tmp_path / "m.plan",
+        "--rate-l-ha", "300", *NAMED, "--out", tmp_path / "m.plan",
     )  # fmt: skip
     assert code == 0
     assert len(found["warnings"]) == 1
@@ -119,7 +123,7 @@ def test_too_low_a_rate_is_flown_faster_only_where_that_is_allowed(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     words = [ANYANG / "boundary.geojson", "--config", ANYANG / "config.toml", "--speed-m-s", "2",
-             "--rate-l-ha", "5", "--out", tmp_path / "m.plan"]  # fmt: skip
+             "--rate-l-ha", "5", *NAMED, "--out", tmp_path / "m.plan"]  # fmt: skip
     _, found, _ = run(capsys, *words)
     assert "(--speed-max-m-s)" in found["warnings"][0]
     assert found["sorties"][0]["speeds_m_s"] == [2.0, 2.0]
@@ -150,9 +154,9 @@ BOW_TIE = Polygon([(0, 0), (100, 100), (100, 0), (0, 100)])
         (box(0, 0, 100, 100), ["--depot", "north"], "--depot"),
         (box(0, 0, 100, 100), ["--rate-l-ha", "0"], "rate above zero"),
         (box(0, 0, 100, 100), ["--rate-l-ha", "nan"], "--rate-l-ha"),
-        (box(0, 0, 100, 100), ["--swath-m", "-6"], "--swath-m -6: write a number greater than 0"),
-        (box(0, 0, 100, 100), ["--swath-m", "0.05"], "passes or more, and a plan has 1000 at most"),
-        (box(0, 0, 100, 100), ["--swath-m", "1e-9"], "passes or more, and a plan has 1000 at most"),
+        (box(0, 0, 100, 100), ["--swath-m", "-6"], "--swath-m -6: write a number greater than"),
+        (box(0, 0, 20, 20), ["--swath-m", "0.05"], "write a number greater than or equal to 0.3"),
+        (box(0, 0, 900, 900), ["--swath-m", "0.5"], "passes or more, and a plan has 1000 at most"),
         (box(0, 0, 100, 100), ["--swath-m", "1e9"], "--swath-m 1e+09: write a number less than or"),
         (box(0, 0, 100, 100), ["--speed-m-s", "nan"], "--speed-m-s nan: write a number"),
         (box(0, 0, 100, 100), ["--speed-m-s", "1e-9"], "greater than or equal to 0.5"),

@@ -127,6 +127,10 @@ def test_the_papers_field_is_planned_and_flown_with_nothing_off_its_lines(
     lines = tmp_path / "field.lines.geojson"
     assert planned["lines_file"] == str(lines)
     own = ["--set", f'mission.lines="{lines}"']
+    assert any("only with mission.lines set" in each for each in planned["warnings"])
+    named = [*own, "--out", str(tmp_path / "again.plan"), "--json", *kept]
+    execute(["plan", str(BOUNDARY), "--config", EXAMPLE, *named])
+    assert "mission.lines" not in str(json.loads(capsys.readouterr().out)["warnings"])
     execute(["config", "check", EXAMPLE, "--json", *own])
     assert "mission.lines" not in str(json.loads(capsys.readouterr().out)["notes"])
     copied = tmp_path / "config.toml"
