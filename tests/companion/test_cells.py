@@ -279,7 +279,7 @@ def test_what_is_no_grid_is_refused() -> None:
         CellGrid(np.zeros((1, 1), np.int32), [1.0], linear(1.0, 0.0, 0.0, 0.0, -1.0, 0.0), good)
     with pytest.raises(ValueError, match="no rate"):
         CellGrid(np.ones((1, 1), np.int32), [1.0], good, good)
-    with pytest.raises(ValueError, match="no rate"):
+    with pytest.raises(ValueError, match="not a rate"):
         CellGrid(np.zeros((1, 1), np.int32), [math.nan], good, good)
     with pytest.raises(ValueError, match="not both"):
         Prescription(builders.plots([[1.0]]), cells=square_cells([[0]]))

@@ -154,7 +154,7 @@ def test_what_cannot_be_declared_changes_nothing(bench: Bench, said: dict[str, A
 
 
 def test_nothing_is_declared_while_the_vehicle_is_armed(bench: Bench) -> None:
-    desk = bench.wire.component._desk
+    desk = bench.wire.component._command_state
     desk.is_armed = True
     outcome = bench.say(KEPT)
     assert (outcome.accepted, outcome.inputs) == (False, ())

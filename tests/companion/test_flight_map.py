@@ -303,7 +303,7 @@ def changed(path: Path, change: Change) -> None:
 def test_a_flight_map_that_was_changed_is_refused(sql: str, tmp_path: Path) -> None:
     path = written(tmp_path).path
     changed(path, lambda connection: connection.executescript(sql))
-    with pytest.raises(MapError, match="no sound flight map") as refused:
+    with pytest.raises(MapError, match="not a sound flight map") as refused:
         read_flight_map(path)
     assert "\n" not in str(refused.value)
     assert refused.value.code == "flight-map"
@@ -387,14 +387,14 @@ WARPS = json.dumps([{"x0": 0.0, "y0": 0.0, "scale": 1.0, "terms": [[5, 0], [0, 1
     [
         ("zones", "geom", polygon((0, 0), (9, 9), (9, 0), (0, 9)), "crosses itself"),
         ("zones", "geom", polygon((0, 0), (1e6, 0), (0, 9)), "farther off"),
-        ("zones", "geom", polygon((0, 0), (7, 0), (0, 9)).replace(SEVEN, NAN), "no number"),
+        ("zones", "geom", polygon((0, 0), (7, 0), (0, 9)).replace(SEVEN, NAN), "not a number"),
         ("zones", "geom", b"GP", "no GeoPackage geometry"),
-        ("zones", "rate_l_ha", -1.0, "no rate"),
+        ("zones", "rate_l_ha", -1.0, "not a rate"),
         ("zones", "rate_l_ha", None, "no rate"),
         ("zones", "name", b"x", "no name"),
         ("field", "geom", geometry_blob(shapely.to_wkb(shapely.Point(1, 1)), srs_id=LOCAL_ID,
                                         is_empty=False), "other than polygons"),
-        ("source_rates", "rate_l_ha", math.inf, "no rate"),
+        ("source_rates", "rate_l_ha", math.inf, "not a rate"),
         ("findings", "severity", "grave", "no severity"),
         ("sources", "sha256", b"x", "another kind"),
     ],
@@ -429,7 +429,7 @@ def test_what_a_flight_map_says_of_itself_is_looked_at(
 ) -> None:
     path = written(tmp_path).path
     changed_with_hash(path, f"UPDATE meta SET value = ? WHERE key = '{key}'", value)
-    with pytest.raises(MapError, match="no sound flight map"):
+    with pytest.raises(MapError, match="not a sound flight map"):
         read_flight_map(path)
 
 
@@ -449,7 +449,7 @@ def test_what_a_flight_map_says_of_itself_is_looked_at(
 def test_cells_that_lie_nowhere_are_refused(column: str, value: object, tmp_path: Path) -> None:
     path = write_flight_map(tmp_path / "a.flightmap.gpkg", map_of_cells()).path
     changed_with_hash(path, f"UPDATE cells SET {column} = ?", value)
-    with pytest.raises(MapError, match="no sound flight map"):
+    with pytest.raises(MapError, match="not a sound flight map"):
         read_flight_map(path)
 
 

@@ -50,7 +50,7 @@ def refused(
 @pytest.mark.parametrize(
     ("arguments", "stdin", "words"),
     [
-        (("prime",), b"", "no terminal"),
+        (("prime",), b"", "not a terminal"),
         (("prime", "--hold-lines"), b"yes\n", "the word was not spray"),
         (("click", "--hold-lines"), b"spray\n", "the word was not click"),
         (("prime", "--hold-lines", "--valve", "7"), b"", "the valves are 1, 2, 3, 4, 5, 6"),

@@ -94,7 +94,7 @@ def test_a_ferry_nearly_along_the_line_is_not_sprayed_over_the_wire(
 
     def heard(link: WireLink, data: bytes) -> None:
         is_told = data[0] == 0xFD and data[7:10] == b"\x2a\0\0"  # MISSION_CURRENT
-        if link.component._desk.is_armed or not is_told:
+        if link.component._command_state.is_armed or not is_told:
             arrive(link, data)
 
     monkeypatch.setattr(WireLink, "arrive", heard)

@@ -336,7 +336,7 @@ async def test_a_port_in_use_is_said_in_one_line() -> None:
         ("serial:/dev/does-not-exist:57600", "no device /dev/does-not-exist"),
         ("serial:/dev/null:57600", "cannot be opened as a serial port"),
         ("tcp:127.0.0.1:1", "connection refused"),
-        ("udpin:192.0.2.1:14550", "no address of this computer"),
+        ("udpin:192.0.2.1:14550", "not an address of this computer"),
     ],
 )
 async def test_a_wrong_url_is_refused_in_one_line(url: str, says: str) -> None:

@@ -22,8 +22,8 @@ from companion.link.component import Component, ComponentOptions
 from companion.web import OperatorPage, Order, Outcome, listen
 from companion.web.live import (
     ADVICE,
+    BoomTrace,
     Live,
-    Way,
     actual_rate,
     map_parts,
     quads_between,
@@ -204,7 +204,7 @@ def _frame(
 
 
 def test_the_way_has_a_point_a_metre_and_at_each_change_and_sums_area_and_volume() -> None:
-    way = Way(valves=((-1.0, 0.0, 2.0), (1.0, 0.0, 2.0)))
+    way = BoomTrace(valves=((-1.0, 0.0, 2.0), (1.0, 0.0, 2.0)))
     for k in range(101):  # 10 s at 5 m/s, ten times a second
         way.take(_frame(0.1 * k, 0.5 * k, bits="11" if k < 80 else "10" if k < 100 else "00"))
     assert len(way.points) == pytest.approx(51, abs=2)

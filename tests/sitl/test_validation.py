@@ -40,9 +40,9 @@ from sitl.studies.validation_flights import (
     EVERY_WAY,
     SPEEDS_M_S,
     Flown,
+    FlownMethod,
     Row,
     Validation,
-    Way,
     pooled,
     validate,
 )
@@ -51,7 +51,7 @@ from tests.sitl.campaign_files import fly_here
 CAMPAIGN = Path(__file__).parents[2] / "examples" / "campaigns" / "validation.toml"
 SEEDS = (4, 5)
 SPEED_M_S = 5.0
-NONE, LOOK_AHEAD = Way(method="none"), Way(method="look-ahead")
+NONE, LOOK_AHEAD = FlownMethod(method="none"), FlownMethod(method="look-ahead")
 CHANGES = 36  # forty plots in four passes
 
 
@@ -78,7 +78,7 @@ def rows_of(percent: float, samples: int, rate_l_ha: float | None = 10.0) -> Rat
 
 @pytest.mark.parametrize("way", [NONE, LOOK_AHEAD])
 def test_the_means_at_5_m_s_are_within_0_3_m_of_the_published_ones(
-    result: Validation, way: Way
+    result: Validation, way: FlownMethod
 ) -> None:
     published = p1_lag_distance_m(way.method, SPEED_M_S)
     lag = result.row(way, SPEED_M_S).settled
