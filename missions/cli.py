@@ -20,19 +20,19 @@ from companion.errors import MapError
 from companion.wording import counted
 from missions.errors import PlanError
 from missions.files.fence import Fences, Ground, fence_warnings
-from missions.files.pilot_sheet import (
-    check_sheet,
-    ground_text,
-    parse_start,
-    product_of,
-    write_sheet,
-)
 from missions.files.write import check_suffix, older_sorties, write_fleet
 from missions.maps.cli.new import parse_mark
 from missions.maps.cli.options import Reading, reading_options
 from missions.maps.model import check_folder
 from missions.mix import mix_lines, mix_of, with_tank
 from missions.picture import check_picture, draw_plan
+from missions.pilot_sheet import (
+    check_sheet,
+    ground_text,
+    parse_start,
+    product_of,
+    write_sheet,
+)
 from missions.plan import LEAVE_PERCENT, Plan
 from missions.planner import plan_mission
 from missions.prices import closing_hint, lines_warnings, overlap_warnings, prices
