@@ -7,7 +7,7 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from analysis.calibration.steps import settle_s
 from companion.config import Config, load
@@ -15,16 +15,8 @@ from companion.core.frame import LocalFrame
 from companion.core.nozzle import SET_UP_FRACTION, rate_for_flow, set_change_l_min
 from companion.errors import ConfigError
 from missions.maps.compiling import compiled_setup
-from sitl.stub.mission_items import MissionItem, landing, speed, waypoint
+from sitl.stub.mission_items import PLACES, MissionItem, landing, speed, waypoint
 from sitl.stub.protocol import dialect
-
-if TYPE_CHECKING:
-    from companion.config import Config
-
-
-from typing import Any
-
-from sitl.stub.mission_items import PLACES
 
 # The flight that `vrspray calibrate lag` needs: strips across the passes, a step at every edge.
 #

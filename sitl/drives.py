@@ -7,6 +7,7 @@ fraction of a plan is a share of the way from the motor's stop to its full pulse
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
@@ -21,9 +22,6 @@ if TYPE_CHECKING:
     from sitl.plant import Floats
     from sitl.profile import PlantProfile
     from sitl.supply import Atomiser
-
-
-from bisect import bisect_right
 
 # A quantity that follows its order as an exponential: a motor's speed, a supply's pressure.
 

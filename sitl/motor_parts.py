@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,17 +10,12 @@ import numpy as np
 from companion.errors import ConfigError
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from companion.config import Config
     from companion.core.setup import Setup
     from sitl.drives import DriveTruth, Ranges
     from sitl.profile import PlantProfile
-
-
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 
 def ranges_us(config: Config) -> Ranges:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import math
+from bisect import bisect_right
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -15,12 +18,6 @@ if TYPE_CHECKING:
 
     from sitl.plant import Edge
     from sitl.profile import PlantProfile
-
-
-import math
-from bisect import bisect_right
-from collections.abc import Sequence
-from typing import NamedTuple
 
 
 class SectionPlant(Plant):

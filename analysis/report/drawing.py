@@ -11,13 +11,14 @@ import shapely
 from matplotlib import colormaps
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
-from matplotlib.ticker import NullLocator
+from matplotlib.ticker import MaxNLocator, NullLocator
 
 from analysis.report.contents import CAUSES
 from analysis.report.figure_style import (
     BLUE,
     DEVIATION_MAP,
     FAINT,
+    GREEN,
     GRID,
     INK,
     NOTHING_COLOUR,
@@ -42,22 +43,11 @@ if TYPE_CHECKING:
     from analysis.assess.breakdowns import Group
     from analysis.assess.cell_maps import CellMaps, Histogram
     from analysis.evaluation import Evaluation
+    from analysis.flown.applied_flight import AppliedFlight, Floats, Series
     from analysis.lag import Step
     from analysis.report.treated import Clock, Treated
     from analysis.student import Interval
-    from analysis.track import Floats, Ints
-
-
-from typing import TYPE_CHECKING
-
-from matplotlib.ticker import MaxNLocator
-
-from analysis.report.figure_style import GREEN
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from analysis.flown.applied_flight import AppliedFlight, Floats, Series
+    from analysis.track import Ints
 
 
 def drawn_of(assessment: Assessment, clock: Clock, treated: Treated) -> Iterator[Drawn]:

@@ -7,31 +7,24 @@ is not known here.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta, tzinfo
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from companion.config.application_table import zone_named
 from companion.core.frame import LocalFrame
+from companion.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from analysis.flown.applied_flight import AppliedFlight, Floats
     from companion.core.boom import Valve
-
-
-import math
-from datetime import UTC, datetime, timedelta, tzinfo
-from typing import TYPE_CHECKING
-
-from companion.config.application_table import zone_named
-from companion.errors import ConfigError
-
-if TYPE_CHECKING:
-    from analysis.flown.applied_flight import AppliedFlight
 
 
 # Points of an edge that lie this near to a straight line say nothing of the ground.

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,7 +18,10 @@ from PIL import Image, ImageDraw, ImageFont
 from analysis.report.folder import check_folder
 from analysis.wsp.card import (
     CARD_WIDTH_MM,
+    FUNGICIDE_PER_CM2,
+    INSECTICIDE_PER_CM2,
     INSET_MM,
+    OVERSPRAY_PERCENT,
     Card,
     Method,
     Reading,
@@ -45,13 +49,6 @@ from companion.errors import ConfigError, JournalError
 if TYPE_CHECKING:
     from analysis.flown.applied_flight import AppliedFlight
     from analysis.wsp.flight_ties import Ties
-
-
-import math
-from collections.abc import Iterator
-from dataclasses import field
-
-from analysis.wsp.card import FUNGICIDE_PER_CM2, INSECTICIDE_PER_CM2, OVERSPRAY_PERCENT
 
 FIGURE = "distributions.png"
 

@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import math
-from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Annotated, Any
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from functools import wraps
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
 if TYPE_CHECKING:
-    from companion.errors import Problem
-
-
-import inspect
-import sys
-import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from functools import wraps
-from typing import TYPE_CHECKING, NamedTuple
-
-if TYPE_CHECKING:
     from rich.progress import Progress
+
+    from companion.errors import Problem
 
 
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")]

@@ -423,7 +423,7 @@ def _in_turn(
     swing about one end, nothing opens once more.
     """
     shares = speed_shares(state, setup.boom, acts_after_s(setup))
-    if min(shares) > 0.0:
+    if all(own > 0.0 for own in shares):
         return routes, shares
     swings = state.yaw_rate_deg_s * state.yaw_gain_deg_s2 > 0.0
     closed: Route = (Crossing(now_s, None, False, 0.0),)

@@ -39,7 +39,7 @@ _MAX_VARIABLES = 1_000
 _DOCUMENTS = ("workOrders", "recommendations", "plans")
 _RATE = re.compile(r"applied(volume|mass|count)perarea(target|actual|control)", re.IGNORECASE)
 _UNITS = {"volume": "L/ha", "mass": "kg/ha", "count": "count/ha"}
-_EXPORT_AGAIN = "copy it again, or export the map again"
+EXPORT_AGAIN = "copy it again, or export the map again"
 
 Json = dict[str, object]
 
@@ -131,18 +131,20 @@ def _parsed(content: bytes, path: Path) -> Json:
             fix="export the map of one field alone",
             code="too-large",
         )
+    return _object(content, path, f"this is not a readable {NAME}")
+
+
+def _object(text: bytes, path: Path, refusal: str) -> Json:
+    """Return a JSON object; what is none is refused in these words, and why."""
     try:
-        root = json.loads(content.decode("utf-8-sig"))
-        if not isinstance(root, dict):
+        found = json.loads(text.decode("utf-8-sig"))
+        if not isinstance(found, dict):
             raise ValueError("it is not an object")
     except (ValueError, RecursionError) as error:
         raise map_error(
-            path,
-            f"this is not a readable {NAME} ({str(error)[:120]})",
-            fix=_EXPORT_AGAIN,
-            code="truncated",
+            path, f"{refusal} ({str(error)[:120]})", fix=EXPORT_AGAIN, code="truncated"
         ) from None
-    return root
+    return found
 
 
 def _member(parent: Json, key: str) -> Json:
@@ -186,7 +188,7 @@ def _variables(
         raise map_error(
             path,
             f"it puts two variables in the same place, {twice[1] or f'band {twice[0]}'}",
-            fix=_EXPORT_AGAIN,
+            fix=EXPORT_AGAIN,
             code="duplicate-code",
         )
     return _told_apart(stored)
@@ -295,18 +297,7 @@ def _geo(text: bytes | None, path: Path) -> dict[str, Any]:
             fix="export the map as GeoParquet",
             code="no-polygon",
         )
-    try:
-        found = json.loads(text)
-        if not isinstance(found, dict):
-            raise ValueError("it is not an object")
-    except (ValueError, RecursionError) as error:
-        raise map_error(
-            path,
-            f"its GeoParquet description is not readable ({str(error)[:80]})",
-            fix=EXPORT_AGAIN,
-            code="truncated",
-        ) from None
-    return found
+    return _object(text, path, "its GeoParquet description is not readable")
 
 
 def _primary(geo: dict[str, Any], path: Path) -> tuple[str, dict[str, Any]]:
@@ -421,7 +412,6 @@ def _stored_name(variable: Variable, table: Table) -> str | None:
 # Text and geometry stay in dictionaries while they are read: a file of a few kilobytes can repeat
 # one long value a million times.
 
-EXPORT_AGAIN = "copy it again, or export the map again"
 _COLUMNS_MAX = 255  # as many as a shapefile can have
 # A million records of ten columns, or 40 000 of 250.
 _CELLS_MAX = 10_000_000

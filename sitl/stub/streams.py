@@ -8,25 +8,24 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from sitl.stub.faults import RC_COUNT, FaultKind, rc_pulses_us
+from sitl.stub.faults import RC_COUNT, FaultClock, FaultKind, rc_pulses_us
 from sitl.stub.firmware import Builder
 from sitl.stub.mission_items import LANDED_STATES
-from sitl.stub.protocol import Message, clipped, dialect
-from sitl.stub.world import Pose
-from sitl.vehicle import GRAVITY_M_S2
-
-if TYPE_CHECKING:
-    from sitl.stub.firmware import Autopilot
-
-
-from sitl.stub.faults import FaultClock
 from sitl.stub.protocol import (
     AUTOPILOT_SYSTEM,
     COMPANION_COMPONENT,
     GROUND_COMPONENT,
     GROUND_SYSTEM,
+    Message,
     Speaker,
+    clipped,
+    dialect,
 )
+from sitl.stub.world import Pose
+from sitl.vehicle import GRAVITY_M_S2
+
+if TYPE_CHECKING:
+    from sitl.stub.firmware import Autopilot
 
 _HEADING_UNKNOWN = 65535
 # MAVLink gives EKF_STATUS_REPORT and ESTIMATOR_STATUS the same flags.
