@@ -235,7 +235,7 @@ def _replaced(value: Any, path: Sequence[str], text: str, hint: Any) -> Any:
     name, rest = path[0], path[1:]
     if isinstance(value, tuple):
         if not (name.isdigit() and int(name) < len(value)):
-            raise ValueError(f"{name} is no index of {len(value)} values, counted from 0")
+            raise ValueError(f"{name} is not an index of {len(value)} values, counted from 0")
         i = int(name)
         return (*value[:i], _replaced(value[i], rest, text, get_args(hint)[0]), *value[i + 1 :])
     if not is_dataclass(value) or isinstance(value, type):

@@ -13,6 +13,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -101,6 +102,15 @@ class CommandTable(TyperGroup):
         """Return one command, imported now."""
         found = find_command(cmd_name)
         return None if found is None else load_command(cmd_name, found)
+
+    def resolve_command(
+        self, ctx: Context, args: list[str]
+    ) -> tuple[str | None, ClickCommand | None, list[str]]:
+        """Return the command that is asked for; of a mistyped one the nearest is named."""
+        if args and not args[0].startswith("-") and find_command(args[0]) is None:
+            near = get_close_matches(args[0], self.list_commands(ctx), n=1)
+            ctx.fail(f"no command {args[0]!r}" + (f"; did you mean {near[0]}?" if near else ""))
+        return super().resolve_command(ctx, args)
 
     def shell_complete(self, ctx: Context, incomplete: str) -> list[CompletionItem]:
         """Return what a word of the shell may become; no command is imported for that."""
@@ -248,7 +258,8 @@ def execute(arguments: Sequence[str]) -> int:
 def _ended(error: BaseException, *, as_json: bool) -> int:
     """Say what ended a command, in one line, and return the exit code."""
     if isinstance(error, typer.TyperException):
-        return _fail(f"{error.format_message()} (see --help)", error.exit_code, as_json=as_json)
+        said = error.format_message().rstrip(".")
+        return _fail(f"{said} (see --help)", error.exit_code, as_json=as_json)
     if isinstance(error, VrsprayError):
         code = FAILED if isinstance(error, ActuatorError | UnreadableError) else REFUSED
         code = INTERRUPTED if isinstance(error, StoppedError) else code

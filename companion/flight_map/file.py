@@ -370,7 +370,7 @@ def _refused(
 def _read(path: Path, connection: sqlite3.Connection) -> FlightMap:
     (application_id,) = connection.execute("PRAGMA application_id").fetchone()
     if application_id != APPLICATION_ID:
-        raise ValueError("it is no GeoPackage")
+        raise ValueError("it is not a GeoPackage")
     check_programs(connection, tables=_TABLES)
     meta = dict(_rows(connection, "key, value", "meta", (str, str)))
     if meta.get("flight_map_version") != VERSION:

@@ -86,7 +86,7 @@ def why_no_setup(error: Exception) -> str:
     text = str(error)
     if text.startswith("set-up of version "):
         return text
-    return "what it says is no set-up that this program knows"
+    return "what it says is not a set-up that this program knows"
 
 
 def extent(connection: sqlite3.Connection) -> str:

@@ -42,7 +42,7 @@ def plan_problems(content: object) -> list[str]:
 
 def _plan(content: object) -> Problems:
     if not isinstance(content, dict):
-        yield "it is no JSON object"
+        yield "it is not a JSON object"
         return
     if content.get("fileType") != "Plan":
         yield "fileType must be 'Plan'"

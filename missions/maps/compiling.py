@@ -292,7 +292,7 @@ def read_plan_lines(path: Path, frame: LocalFrame) -> tuple[Polyline, ...]:
     document = _document(path)
     features = document.get("features")
     if document.get("type") != "FeatureCollection" or not isinstance(features, list):
-        raise _refused(path, "this is no GeoJSON with features")
+        raise _refused(path, "this is not GeoJSON with features")
     lines = [line for feature in features if (line := _line(path, feature, frame)) is not None]
     if not lines:
         raise _refused(path, 'no LineString has kind = "spray"')
@@ -316,7 +316,7 @@ def _line(path: Path, feature: Any, frame: LocalFrame) -> _Line | None:
         return None
     shape = feature.get("geometry")
     if not isinstance(shape, dict) or shape.get("type") != "LineString":
-        raise _refused(path, "a spray line is no LineString")
+        raise _refused(path, "a spray line is not a LineString")
     places = shape.get("coordinates")
     if not isinstance(places, list) or len(places) < 2:
         raise _refused(path, "a spray line has less than two points")

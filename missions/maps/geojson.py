@@ -139,7 +139,7 @@ def _features(document: dict[str, object], path: Path) -> list[dict[str, object]
         return [{"geometry": document}]
     features = document.get("features") if kind == "FeatureCollection" else [document]
     if kind not in ("FeatureCollection", "Feature") or not isinstance(features, list):
-        raise _no_map(path, f"GeoJSON of type {kind[:40]!r} is no map")
+        raise _no_map(path, f"GeoJSON of type {kind[:40]!r} is not a map")
     if not all(isinstance(feature, dict) for feature in features):
         raise _no_map(path, "a feature is not an object")
     return features

@@ -473,7 +473,7 @@ def open_database(content: bytes, path: Path) -> Iterator[Database]:
     if not content.startswith(_MAGIC):
         raise map_error(
             path,
-            "this is no SQLite database, or it is encrypted",
+            "this is not an SQLite database, or it is encrypted",
             fix="export the map again",
             code="unknown-format",
         )

@@ -81,7 +81,7 @@ def read_raster(
     """
     if not content.startswith(_MAGIC):
         raise map_error(
-            path, "this is no TIFF file", fix="export the map again as GeoTIFF",
+            path, "this is not a TIFF file", fix="export the map again as GeoTIFF",
             code="unknown-format",
         )  # fmt: skip
     with _opened(content, path, layer) as source:

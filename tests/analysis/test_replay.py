@@ -266,7 +266,7 @@ def test_a_setting_can_be_changed(text: str, path: str, value: object) -> None:
         ("lag.on_s=-1", "must lie in"),
         ("lag=1", "name one of its fields"),
         ("lag.on_s.x=1", "nothing below it"),
-        ("boom.valves.9.width_m=1", "no index of 6 values"),
+        ("boom.valves.9.width_m=1", "not an index of 6 values"),
         ("limits.wind_required=maybe", "none of true"),
         ("limits.fix=best", r"none of .*rtk-float"),
         ("timing.on_s=1", "timing is unknown"),

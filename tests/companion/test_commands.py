@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from companion.cli.app import execute
 from companion.commands import registered
 from tests.companion.test_flight_map import config_naming, office_files, written
 from tests.companion.wire_peer import free_port, heard
@@ -111,6 +112,20 @@ def test_nobody_replaces_a_command_of_ours(installed: Path) -> None:
         done = vrspray(installed, name, "--help")
         assert done.returncode == 0
         assert "Return three." not in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [
+        ("plam", "error: no command 'plam'; did you mean plan? (see --help)"),
+        ("xyzzy", "error: no command 'xyzzy' (see --help)"),
+    ],
+)
+def test_of_a_mistyped_command_the_nearest_is_named(
+    capsys: pytest.CaptureFixture[str], typed: str, said: str
+) -> None:
+    assert execute([typed]) == 2
+    assert capsys.readouterr().err.splitlines() == [said]
 
 
 def test_every_registered_command_is_a_line_and_no_more() -> None:

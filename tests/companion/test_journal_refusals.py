@@ -114,7 +114,7 @@ DAMAGED: dict[str, tuple[Damage, str]] = {
     "no version": (sql("DELETE FROM meta WHERE key = 'journal_version'"), "version is missing"),
     "no setup": (sql("DELETE FROM meta WHERE key = 'setup'"), "no set-up of the flight: it is"),
     "setup": (sql(SETUP.format("substr(value, 1, 300)")), "its text is garbled or breaks off"),
-    "other setup": (sql(SETUP.format("'[]'")), "what it says is no set-up that this program"),
+    "other setup": (sql(SETUP.format("'[]'")), "what it says is not a set-up that this program"),
     "one sample": (
         sql("DELETE FROM applied WHERE sequence > (SELECT min(sequence) + 9 FROM applied)"),
         " rows, 122 were written",

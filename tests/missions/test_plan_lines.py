@@ -63,7 +63,7 @@ def test_only_spray_lines_are_read_and_those_that_go_on_are_joined(tmp_path: Pat
     ("text", "said"),
     [
         ("{", "not readable JSON"),
-        ("[]", "no GeoJSON"),
+        ("[]", "not GeoJSON"),
         ('{"type": "FeatureCollection", "features": []}', "no LineString"),
         ("[" * 100_000, "not readable JSON"),
     ],

@@ -237,7 +237,7 @@ def _ring(element: Element) -> Floats:
     if not all(east and north for east, north in pairs):
         raise ValueError("a point lacks its latitude (C) or longitude (D)")
     if not _DIGITS.issuperset("".join(east + north for east, north in pairs)):
-        raise ValueError("a coordinate is no plain decimal number")
+        raise ValueError("a coordinate is not a plain decimal number")
     ring = np.array([(float(east), float(north)) for east, north in pairs], dtype=np.float64)
     if len(ring) and not np.array_equal(ring[0], ring[-1]):
         ring = np.vstack([ring, ring[:1]])
