@@ -173,7 +173,9 @@ def _notes(fit: MarksFit, settings: dict[str, Estimate | None], present: Present
         notes.append("some valves have a forward_m of their own: add errors.body_offset_m to each")
     position = settings["position_s"]
     if position is not None and not abs(position.value) <= POSITION_S_MAX:
-        notes.append(f"position_s = {position.value:.2f} is not an age of a position; check the signs")
+        notes.append(
+            f"position_s = {position.value:.2f} is not an age of a position; check the signs"
+        )
     elif position is not None and position.high < 0.0:
         notes.append("position_s is below 0: a lag or output_s is set too long; identify the lags")
     if not present.known:

@@ -181,7 +181,8 @@ def _shape(seen: Seen) -> Iterator[tuple[str, str]]:
     if not any(_near(short, a) and _near(long, b) for a, b in FORMATS_MM):
         yield (
             "card-size",
-            f"{short:.1f} x {long:.1f} mm is not a usual card (26 x 76, 52 x 76): cut, or another dpi",
+            f"{short:.1f} x {long:.1f} mm is not a usual card (26 x 76, 52 x 76):"
+            " cut, or another dpi",
         )
 
 
