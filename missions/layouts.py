@@ -258,12 +258,20 @@ def _spare(field: Field, settings: Settings, lost_share: float = LOST_SHARE) -> 
 def _aim(settings: Settings, area_m2: float, left_share: float) -> Aim:
     """Return what lines may leave out and cover twice."""
     once, cap = settings.closing_share, settings.overlap_max_percent
+    # Of the litres, which fall on ground that is covered once and twice.
+    twice = None if cap is None else cap / max(100.0 - cap, 1e-9)
     return Aim(
         left_max_m2=left_share * area_m2,
         doubled_s_m2=once * LAYOUT_WEIGHT / (settings.swath_width_m * settings.speed_m_s),
-        doubled_max_m2=None if cap is None else cap / 100.0 * area_m2 / once,
-        covers_first=cap is None or settings.leave_max_percent > LEAVE_PERCENT,
+        doubled_max_share=None if twice is None else twice / once,
+        target_m2=area_m2,
+        covers_first=covers_first(settings),
     )
+
+
+def covers_first(settings: Settings) -> bool:
+    """Return whether ground is covered rather than a cap of overlap kept."""
+    return settings.overlap_max_percent is None or settings.leave_max_percent > LEAVE_PERCENT
 
 
 def _courses(inner: BaseGeometry, field: Field, settings: Settings, motion: Motion) -> list[float]:

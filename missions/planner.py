@@ -25,12 +25,12 @@ from missions.files.fence import Fences
 from missions.files.items import ITEMS_MAX, count_of, stops_of
 from missions.fleet import fleet_sorties
 from missions.free_space import free_space
-from missions.layouts import crowded, flyable, is_small, spray_lines
+from missions.layouts import covers_first, crowded, flyable, is_small, spray_lines
 from missions.paced import Paced, in_room, range_warnings, room_warnings
 from missions.plan import Leg, Plan, Settings, Sortie, flown_lines, nose_s, sortie_wh
 from missions.remaining import Remaining, UntreatedRates, demands_once
 from missions.searching import lines_are_drawn
-from missions.sheet import scheduled
+from missions.sheet import overlap_by_sortie_l, scheduled
 from missions.sorties import Flying, SortieSearch
 from missions.spacing import Spacing
 from missions.speeds import choices, chosen, crawl_warnings, short_warnings, stretches_of
@@ -85,17 +85,46 @@ def plan_mission(
     Raises:
         PlanError: where there is none, in one line with what to change.
     """
+    planned = partial(
+        _planned, field, rates=rates, depots=depots, left=left, around=around,
+        with_sprayer=with_sprayer, fences=fences,
+    )  # fmt: skip
     try:
-        return _planned(field, settings, rates, depots, left, around, with_sprayer, fences)
+        if settings.overlap_max_percent is None or left or not is_small(field, settings):
+            return planned(settings)
+        return _within_overlap(planned, settings)
     except ShapelyError as error:
         raise PlanError(
             f"the field's geometry cannot be used ({str(error)[:120]}); simplify its outline"
         ) from error
 
 
+# What falls twice is known for certain only of a plan: how often valves that close save it depends
+# on which pass comes first. So often it is planned anew, for a cap that much lower than is missing.
+OVERLAP_TRIES, OVERLAP_LESS = 4, 0.9
+
+
+def _within_overlap(planned: Callable[[Settings], Plan], settings: Settings) -> Plan:
+    """Return the first plan within the cap of overlap; where there is none, that of the least."""
+    cap = settings.overlap_max_percent
+    assert cap is not None
+    aimed = cap
+    found: list[tuple[float, int, Plan]] = []
+    for _ in range(OVERLAP_TRIES):
+        plan = planned(replace(settings, overlap_max_percent=aimed))
+        twice = sum(overlap_by_sortie_l(plan).values())
+        found.append((100.0 * twice / plan.volume_l, len(found), plan))
+        if found[-1][0] <= cap:
+            break
+        aimed *= OVERLAP_LESS * cap / found[-1][0]
+    _, _, best = min(found, key=lambda each: each[:2])
+    return replace(best, settings=replace(best.settings, overlap_max_percent=cap))
+
+
 def _planned(
     field: Field,
     settings: Settings,
+    *,
     rates: Rates,
     depots: tuple[tuple[float, float], ...],
     left: Remaining | None,
@@ -107,9 +136,7 @@ def _planned(
     settings = _of_its_size(settings, field)
     boom, motion = boom_of(settings, field), settings.motion
     if left is None:
-        lines, angle_deg = spray_lines(field, settings, motion)
-        lines = joined([lines, narrow_patches(lines, field.spray, field.limit, width_m)])
-        lines = flyable(lines, field, settings)
+        lines, angle_deg = _lines(field, settings)
         sprayed = lines
     else:
         lines, angle_deg = left.lines, left.angle_deg
@@ -195,6 +222,15 @@ def _planned(
         terrain=around.terrain,
     )
     return scheduled(plan)
+
+
+def _lines(field: Field, settings: Settings) -> tuple[Floats, float]:
+    """Return the lines that are flown over a whole field, and the course of the parallel ones."""
+    width_m = settings.swath_width_m
+    lines, angle_deg = spray_lines(field, settings, settings.motion)
+    if covers_first(settings) or not is_small(field, settings):
+        lines = joined([lines, narrow_patches(lines, field.spray, field.limit, width_m)])
+    return flyable(lines, field, settings), angle_deg
 
 
 def _from_depots(

@@ -61,9 +61,10 @@ def overlap_warnings(plan: Plan, overlap_litres_percent: float) -> tuple[str, ..
     if cap is None or overlap_litres_percent <= cap:
         return ()
     closing = plan.settings.switch_off_percent is None
+    least = ", the least found for this field" if is_small(plan.field, plan.settings) else ""
     return (
-        f"{overlap_litres_percent:.1f} % of the litres are sprayed twice, above --overlap-max "
-        f"{cap:g}; "
+        f"{overlap_litres_percent:.1f} % of the litres are sprayed twice{least}, above "
+        f"--overlap-max {cap:g}; "
         + (
             "allow more to be left with --leave-max, or close valves over treated ground with "
             "coverage.switch_off_percent = 100 in the configuration"

@@ -129,13 +129,14 @@ def _fan(
 class Aim:
     """What is wanted: ground that may be left, and what ground sprayed twice is worth.
 
-    `doubled_max_m2` is how much may be sprayed twice at most; None where time alone decides. Where
-    both cannot be kept, `covers_first` says which of them is.
+    `doubled_max_share` of what is covered of `target_m2` may be sprayed twice at most; None where
+    time alone decides. Where both cannot be kept, `covers_first` says which of them is.
     """
 
     left_max_m2: float
     doubled_s_m2: float
-    doubled_max_m2: float | None = None
+    doubled_max_share: float | None = None
+    target_m2: float = 0.0
     covers_first: bool = True
 
     def cost_s(self, *, left_m2: float, doubled_m2: float) -> float:
@@ -144,8 +145,9 @@ class Aim:
         first, second = LEFT_S_M2, LEFT_S_M2 / 8.0
         left_s_m2, twice_s_m2 = (first, second) if self.covers_first else (second, first)
         cost += left_s_m2 * max(left_m2 - self.left_max_m2, 0.0)
-        if self.doubled_max_m2 is not None:
-            cost += twice_s_m2 * max(doubled_m2 - self.doubled_max_m2, 0.0)
+        if self.doubled_max_share is not None:
+            doubled_max_m2 = self.doubled_max_share * (self.target_m2 - left_m2)
+            cost += twice_s_m2 * max(doubled_m2 - doubled_max_m2, 0.0)
         return cost
 
 

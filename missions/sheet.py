@@ -182,7 +182,7 @@ def sheet(plan: Plan, *, with_sprayer: bool = False, once: bool = False) -> dict
     `once` is said of litres that already leave out what is sprayed twice.
     """
     found: dict[str, Any] = plan.summary() | {"least_idle_m": least_idle_of(plan)}
-    overlap_l = {} if once else _overlap_l(plan)
+    overlap_l = {} if once else overlap_by_sortie_l(plan)
     found["overlap_l"] = sum(overlap_l.values())
     found["overlap_litres_percent"] = 100.0 * found["overlap_l"] / plan.volume_l
     filled = filled_of(plan)
@@ -205,7 +205,7 @@ def _farthest_m(plan: Plan, sortie: Sortie) -> float:
     return max(math.dist(depot, place) for leg in sortie.legs for place in leg.points)
 
 
-def _overlap_l(plan: Plan) -> dict[int, float]:
+def overlap_by_sortie_l(plan: Plan) -> dict[int, float]:
     """Return the litres of each sortie that fall on ground already sprayed.
 
     A line's litres count evenly along it; where valves close, they are counted by valve.

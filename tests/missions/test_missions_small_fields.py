@@ -140,10 +140,32 @@ def test_overlap_asked_for_is_kept_where_ground_may_be_left() -> None:
     assert not overlap_warnings(plan, sheet(plan)["overlap_litres_percent"])
 
 
+@pytest.mark.parametrize(("kind", "seed", "cap"), [("ditch", 1002, 5.0), ("bent ditch", 1000, 5.0)])
+def test_overlap_asked_for_counts_lines_that_are_added_last(
+    kind: str, seed: int, cap: float
+) -> None:
+    # A stroke across the end of the ditch: 5.7 and 5.1 % of the litres.
+    plan = plan_of(made_up(kind, seed), overlap_max_percent=cap)
+    assert sheet(plan)["overlap_litres_percent"] <= cap
+    assert plan.settings.overlap_max_percent == cap
+
+
+@pytest.mark.parametrize("number", [0, 3])
+def test_overlap_asked_for_is_kept_by_valves_that_close(number: int) -> None:
+    # What they save is known of a whole plan only: the first one has 2.6 and 1.7 %.
+    plan = plan_of(
+        made_up("L", 1000 + number), overlap_max_percent=1.0, valves=VALVES,
+        switch_off_percent=100.0,
+    )  # fmt: skip
+    assert sheet(plan)["overlap_litres_percent"] <= 1.0
+    assert plan.coverage.reachable_percent > 90.0
+
+
 def test_overlap_above_what_was_asked_for_is_said_with_what_to_do() -> None:
     plan = plan_of(box(0.0, 0.0, 90.0, DITCH_M), overlap_max_percent=5.0, leave_max_percent=1.0)
     found = sheet(plan)["overlap_litres_percent"]
     assert plan.coverage.reachable_percent >= 99.0
+    assert "the least found for this field" in overlap_warnings(plan, found)[0]
     assert "--leave-max" in overlap_warnings(plan, found)[0]
     assert "coverage.switch_off_percent" in overlap_warnings(plan, found)[0]
 
