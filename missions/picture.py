@@ -9,7 +9,6 @@ import colorsys
 import importlib.util
 import math
 from collections.abc import Iterable
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,12 +16,13 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from companion.map_pictures import draw_below
 from companion.wording import counted, install_command
 from missions.boom import boom_of
 from missions.errors import PlanError
 from missions.maps.local import polygons_of
 from missions.maps.model import write_whole
-from missions.maps.picture import Sheet, printable, scale_length_m, sheet_for
+from missions.maps.picture import STYLE, SUFFIXES, Sheet, content_of, printable, sheet_for
 from missions.plan import Leg, Plan, Sortie
 from missions.strips import GRID_M, Objects, whole
 
@@ -31,14 +31,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-SUFFIXES = (".png", ".svg", ".pdf")
 # Of a large field more dots an inch, so that a swath is some dots wide.
 DPI_MIN, DPI_MAX, SWATH_DOTS = 110.0, 250.0, 7.0
 # What is nowhere this wide is the rounding of strips that touch, and the margin of the border.
 SEEN_M = 0.05
-_METADATA: dict[str, dict[str, str | None]] = {
-    ".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None},
-}  # fmt: skip
 
 
 def check_picture(out: Path) -> None:
@@ -58,11 +54,9 @@ def draw_plan(plan: Plan, out: Path, *, title: str) -> None:
     sheet = sheet_for(_bounds_m(plan))
     swath_in = plan.settings.swath_width_m / sheet.metres_per_inch
     dpi = min(max(SWATH_DOTS / swath_in, DPI_MIN), DPI_MAX)
-    with rc_context({"font.family": "DejaVu Sans", "svg.hashsalt": "vrspray"}):
-        content = BytesIO()
-        figure = _figure(plan, sheet, title)
-        figure.savefig(content, format=suffix[1:], dpi=dpi, metadata=_METADATA[suffix])
-    write_whole(out, content.getvalue())
+    with rc_context(STYLE):
+        content = content_of(_figure(plan, sheet, title), suffix, dpi=dpi)
+    write_whole(out, content)
 
 
 def sprayed_twice(strips: Objects) -> BaseGeometry:
@@ -95,7 +89,7 @@ def _figure(plan: Plan, sheet: Sheet, title: str) -> Figure:
         _draw_route(axes, sortie, swath_pt=swath_pt, points_per_m=72.0 / sheet.metres_per_inch)
     _draw_ends(axes, plan)
     _draw_depots(axes, plan)
-    draw_scale(axes, sheet)
+    draw_below(axes, sheet.map_in[1])
     if plan.wind is not None:
         draw_wind(axes, sheet, plan.wind)
     write_title(figure, plan, title)
@@ -273,33 +267,6 @@ def colour_of(number: int) -> Colour:
     """
     hue = (0.58 + 0.381966 * (number - 1)) % 1.0
     return colorsys.hls_to_rgb(hue, (0.42, 0.55)[(number // 8) % 2], 0.62)
-
-
-def draw_scale(axes: Axes, sheet: Sheet) -> None:
-    """Draw a round length and the arrow to the north, below the map."""
-    west, _, east, _ = sheet.ground_m
-    length_m = scale_length_m(east - west)
-    across = axes.get_xaxis_transform()
-    down = 0.3 / sheet.map_in[1]
-    axes.plot(
-        [west, west + length_m], [-down, -down], color="black", linewidth=4.0, transform=across,
-        clip_on=False,
-        solid_capstyle="butt",
-    )  # fmt: skip
-    text = f"{length_m / 1000:g} km" if length_m >= 1000.0 else f"{length_m:g} m"
-    axes.text(
-        west + length_m / 2.0, -1.4 * down, text, transform=across, ha="center", va="top",
-        fontsize=11,
-    )  # fmt: skip
-    axes.annotate(
-        "N", xy=(0.97, -0.1 / sheet.map_in[1]), xytext=(0.97, -0.72 / sheet.map_in[1]),
-        xycoords="axes fraction",
-        ha="center",
-        fontsize=13,
-        fontweight="bold",
-        arrowprops={"facecolor": "black", "width": 3.0, "headwidth": 10.0, "headlength": 10.0},
-        annotation_clip=False,
-    )  # fmt: skip
 
 
 def draw_wind(axes: Axes, sheet: Sheet, wind: tuple[float, float]) -> None:

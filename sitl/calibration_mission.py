@@ -9,11 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import shapely
+
 from analysis.calibration.steps import settle_s
 from companion.config import Config, load
 from companion.core.frame import LocalFrame
 from companion.core.nozzle import SET_UP_FRACTION, rate_for_flow, set_change_l_min
 from companion.errors import ConfigError
+from companion.map_formats import geojson_feature, geojson_text
 from missions.maps.compiling import compiled_setup
 from sitl.stub.mission_items import PLACES, MissionItem, landing, speed, waypoint
 from sitl.stub.protocol import dialect
@@ -219,17 +222,13 @@ def _map_text(layout: Layout, turned: _Turned) -> str:
             (to_m, left_m),
             (from_m, left_m),
         )
-        ring = [[round(value, 9) for value in turned.place(*corner)[::-1]] for corner in corners]
+        ground = shapely.Polygon([turned.place(*corner)[::-1] for corner in corners])
         rate = rate_for_flow(flow, layout.speed_m_s, layout.boom_m) if flow else 0.0
         name = f"{number + 1}.{place + 1}"
-        feature = {
-            "type": "Feature",
-            "properties": {"name": name, "rate": round(rate, 6), "unit": "L/ha"},
-            "geometry": {"type": "Polygon", "coordinates": [ring]},
-        }
-        features.append(json.dumps(feature))
-    lines = ",\n".join(features)
-    return f'{{"type": "FeatureCollection",\n"features": [\n{lines}\n]}}\n'
+        features.append(
+            geojson_feature(ground, {"name": name, "rate": round(rate, 6), "unit": "L/ha"})
+        )
+    return geojson_text(features)
 
 
 def _items(layout: Layout, turned: _Turned) -> tuple[MissionItem, ...]:

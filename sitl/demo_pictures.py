@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from analysis.published import p1_lag_distance_m
 from analysis.report import figure_style
 from analysis.report.figure_style import FAINT, INK, QUIET
+from companion.map_pictures import draw_bar, length_text
 from sitl.anyang import demo_setup
 from sitl.demo import (
     CELL_M,
@@ -362,16 +363,8 @@ def _arrows(panel: Axes, axes: FieldAxes) -> None:
 
 def _scale_and_north(panel: Axes, axes: FieldAxes) -> None:
     y_m = -MARGIN_Y_M - 3.0
-    for x_m, colour in ((0.0, INK), (10.0, FAINT)):
-        panel.plot(
-            [x_m, x_m + 10.0],
-            [y_m, y_m],
-            color=colour,
-            lw=4.0,
-            solid_capstyle="butt",
-            clip_on=False,
-        )
-    panel.text(21.0, y_m, "20 m", va="center", size=9)
+    draw_bar(panel, 0.0, y_m, 20.0)
+    panel.text(21.0, y_m, length_text(20.0), va="center", size=9)
     # The picture's x is the course of the first pass: north is turned back from it.
     course = np.radians(axes.course_deg)
     tail = np.array([34.0, y_m - 0.6])

@@ -5,6 +5,7 @@ others load by, or an import inside a function (it is loaded only when it is ask
 single importer belongs into it, unless the two together pass 600 lines. What is an exception has
 its reason here. No module has more than 600 lines, and no function says more than 60: from its
 first statement to its end, without signature (a command's declares its options) and docstring.
+A name that begins with `_` is its module's own: no other imports it (ruff sees `module._name`).
 """
 
 from __future__ import annotations
@@ -140,6 +141,27 @@ def long_functions(files: dict[str, Path]) -> list[str]:
     ]
 
 
+def private_imports(files: dict[str, Path]) -> list[str]:
+    """Return where a module imports what another keeps to itself: a name, or a whole module."""
+    found = []
+    for user, path in files.items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = []
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                names = [f"{node.module}.{alias.name}" for alias in node.names]
+            for name in names:
+                top, *parts = name.split(".")
+                if top in PACKAGES and any(_is_private(part) for part in parts):
+                    found.append(f"{user}: imports {name}, which is private")
+    return found
+
+
+def _is_private(name: str) -> bool:
+    return name.startswith("_") and not name.endswith("__")
+
+
 def findings(root: Path = ROOT) -> list[str]:
     """Return what breaks a rule, one line each."""
     files = modules(root)
@@ -164,7 +186,7 @@ def findings(root: Path = ROOT) -> list[str]:
         elif size[name] + size[next(iter(users))] <= LINES_MAX:
             found.append(f"{name}: only {next(iter(users))} imports it: fold it into that")
     found += [f"{name}: no module, and an exception" for name in EXCEPTIONS if name not in files]
-    return found + long_functions(files)
+    return found + private_imports(files) + long_functions(files)
 
 
 def main() -> int:

@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import shapely
 
+from companion.map_formats import DEGREE_DECIMALS, GEOJSON_TAIL, geojson_head
+
 if TYPE_CHECKING:
     from analysis.exports.output import Content
     from analysis.exports.source import Source
 
-DEGREE_DECIMALS = 9
 _BLOCK = 5_000
 
 
@@ -33,9 +34,8 @@ def make_lines(source: Source, out: Path) -> Content:
 
 
 def _document(source: Source) -> Iterator[bytes]:
-    facts = json.dumps(source.facts(), allow_nan=False)
-    yield f'{{"type": "FeatureCollection",\n"vrspray": {facts},\n"features": [\n'.encode()
-    yield from _blocks(_features(source), between=",\n", end="\n]}\n")
+    yield geojson_head(vrspray=source.facts()).encode()
+    yield from _blocks(_features(source), between=",\n", end=GEOJSON_TAIL)
 
 
 def _blocks(features: Iterable[str], *, between: str, end: str) -> Iterator[bytes]:

@@ -20,7 +20,7 @@ import shapely
 from numpy.typing import NDArray
 
 from analysis.exports.columns import utc_text
-from analysis.exports.output import zipped
+from companion.map_formats import zipped
 
 if TYPE_CHECKING:
     from analysis.exports.output import Content

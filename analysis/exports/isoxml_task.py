@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from shapely import MultiPolygon, Polygon
 
 from analysis.exports.columns import utc_ms
-from analysis.exports.output import geographic, zipped
+from analysis.exports.output import geographic
+from companion.map_formats import zipped
 
 if TYPE_CHECKING:
     from analysis.exports.columns import About

@@ -6,7 +6,6 @@ that can be switched off.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
@@ -15,9 +14,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from shapely import MultiPolygon, Polygon
+from shapely import Polygon
 
-from analysis.exports.output import geographic, zipped
+from analysis.exports.output import geographic
+from companion.map_formats import (
+    KML_HEAD,
+    KML_TAIL,
+    kml_colour,
+    kml_ground,
+    kml_places,
+    kml_text,
+    zipped,
+)
 
 if TYPE_CHECKING:
     from analysis.exports.columns import Column
@@ -35,11 +43,8 @@ _RAMP = (
 _OPAQUE = "d8"
 # Rates beyond these shares of all are outliers: they take the colours of the ends.
 _ENDS_PERCENT = (2.0, 98.0)
-_DEGREE_DECIMALS = 9
 # Corners of the path on the ground; nobody sees more.
 _PATH_STEP_M = 1.0
-# What XML 1.0 cannot hold, not even as a reference (section 2.2).
-_FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 def make(source: Source, out: Path) -> Content:
@@ -55,10 +60,9 @@ def _document(source: Source) -> Iterator[str]:
     unit = source.units["rate"]
     rates = source.swaths.applied_l_ha * unit.factor
     limits = _limits(rates)
-    yield '<?xml version="1.0" encoding="UTF-8"?>\n'
-    yield '<kml xmlns="http://www.opengis.net/kml/2.2">\n<Document>\n'
-    yield f"<name>{_text(source.about.title)}</name>\n"
-    yield f"<description>{_text(_said(source, limits, unit.label))}</description>\n"
+    yield f"{KML_HEAD}<Document>\n"
+    yield f"<name>{kml_text(source.about.title)}</name>\n"
+    yield f"<description>{kml_text(_said(source, limits, unit.label))}</description>\n"
     yield f"<TimeSpan><begin>{source.about.started_utc}</begin>"
     yield f"<end>{source.about.ended_utc}</end></TimeSpan>\n"
     yield from _styles()
@@ -66,7 +70,7 @@ def _document(source: Source) -> Iterator[str]:
     yield from _field(source)
     yield from _path(source)
     yield from _legend(source, limits, unit.label)
-    yield "</Document>\n</kml>\n"
+    yield f"</Document>\n{KML_TAIL}"
 
 
 def _limits(rates: Floats) -> Floats:
@@ -97,10 +101,10 @@ def _said(source: Source, limits: Floats, label: str) -> str:
 
 
 def _styles() -> Iterator[str]:
-    for number, (red, green, blue) in enumerate(_RAMP):
+    for number, colour in enumerate(_RAMP):
         yield f'<Style id="rate{number}"><LabelStyle><scale>0.8</scale></LabelStyle>'
         yield "<IconStyle><scale>0</scale></IconStyle>"
-        yield f"<PolyStyle><color>{_OPAQUE}{blue:02x}{green:02x}{red:02x}</color>"
+        yield f"<PolyStyle><color>{kml_colour(colour, opacity=_OPAQUE)}</color>"
         yield "<outline>0</outline></PolyStyle></Style>\n"
     yield '<Style id="field"><LineStyle><color>ffffffff</color><width>2</width></LineStyle>'
     yield "<PolyStyle><fill>0</fill></PolyStyle></Style>\n"
@@ -130,8 +134,8 @@ def _applied(
         yield '<ExtendedData><SchemaData schemaUrl="#applied">'
         for name, value in zip(names, row, strict=True):
             if value:
-                yield f'<SimpleData name="{name}">{_text(value)}</SimpleData>'
-        yield f"</SchemaData></ExtendedData>{_geometry(ground)}</Placemark>\n"
+                yield f'<SimpleData name="{name}">{kml_text(value)}</SimpleData>'
+        yield f"</SchemaData></ExtendedData>{kml_ground(ground)}</Placemark>\n"
     yield "</Document>\n"
 
 
@@ -141,7 +145,7 @@ def _field(source: Source) -> Iterator[str]:
         return
     (outline,) = geographic([ground], source.flight.setup.frame)
     yield "<Folder>\n<name>field</name>\n<Placemark><name>field</name>"
-    yield f"<styleUrl>#field</styleUrl>{_geometry(outline)}</Placemark>\n"
+    yield f"<styleUrl>#field</styleUrl>{kml_ground(outline)}</Placemark>\n"
     yield "</Folder>\n"
 
 
@@ -154,7 +158,7 @@ def _path(source: Source) -> Iterator[str]:
         return
     yield "<Folder>\n<name>path</name>\n<visibility>0</visibility>\n<Placemark><name>path</name>"
     yield "<visibility>0</visibility><styleUrl>#path</styleUrl><LineString>"
-    yield f"<tessellate>1</tessellate><coordinates>{_coordinates(places)}</coordinates>"
+    yield f"<tessellate>1</tessellate><coordinates>{kml_places(places)}</coordinates>"
     yield "</LineString></Placemark>\n</Folder>\n"
 
 
@@ -170,35 +174,9 @@ def _legend(source: Source, limits: Floats, label: str) -> Iterator[str]:
         east, north = shapely.get_coordinates(box).T.tolist()
         latitude_deg, longitude_deg = frame.to_geographic_all(east, north)
         corners = np.stack((longitude_deg, latitude_deg), axis=1)
-        middle = _coordinates(corners[:4].mean(axis=0, keepdims=True))
+        middle = kml_places(corners[:4].mean(axis=0, keepdims=True))
         name = f"{limits[number]:.3g} to {limits[number + 1]:.3g} {label}"
-        yield f"<Placemark><name>{_text(name)}</name><styleUrl>#rate{number}</styleUrl>"
+        yield f"<Placemark><name>{kml_text(name)}</name><styleUrl>#rate{number}</styleUrl>"
         yield f"<MultiGeometry><Point><coordinates>{middle}</coordinates></Point>"
-        yield f"{_polygon(Polygon(corners))}</MultiGeometry></Placemark>\n"
+        yield f"{kml_ground(Polygon(corners))}</MultiGeometry></Placemark>\n"
     yield "</Folder>\n"
-
-
-def _geometry(ground: Polygon | MultiPolygon) -> str:
-    if isinstance(ground, MultiPolygon):
-        return f"<MultiGeometry>{''.join(_polygon(each) for each in ground.geoms)}</MultiGeometry>"
-    return _polygon(ground)
-
-
-def _polygon(ground: Polygon) -> str:
-    rings = [("outer", ground.exterior), *(("inner", ring) for ring in ground.interiors)]
-    inside = "".join(
-        f"<{side}BoundaryIs><LinearRing><coordinates>"
-        f"{_coordinates(shapely.get_coordinates(ring))}"
-        f"</coordinates></LinearRing></{side}BoundaryIs>"
-        for side, ring in rings
-    )
-    return f"<Polygon><tessellate>1</tessellate>{inside}</Polygon>"
-
-
-def _coordinates(points: Floats) -> str:
-    form = f"%.{_DEGREE_DECIMALS}f,%.{_DEGREE_DECIMALS}f"
-    return " ".join(form % (east, north) for east, north in points.tolist())
-
-
-def _text(text: str) -> str:
-    return escape(_FORBIDDEN.sub("", text), quote=False)

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-import zipfile
 from collections.abc import Iterable, Mapping
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -31,10 +29,6 @@ if TYPE_CHECKING:
 # Content of files by their names, in the order in which they are moved: what makes the others
 # worth reading comes last.
 Content = Mapping[str, Iterable[bytes]]
-
-# A zip has times of its members; the earliest it can hold makes the same bytes every time.
-_NO_TIME = (1980, 1, 1, 0, 0, 0)
-_READ_BY_ALL = 0o644 << 16
 
 
 class ExportError(VrsprayError):
@@ -79,18 +73,6 @@ def write_folder(out: Path, content: Content, *, force: bool) -> int:
     except OSError as error:
         raise _not_written(out, error) from None
     return size
-
-
-def zipped(members: Mapping[str, bytes]) -> bytes:
-    """Return a zip of files."""
-    packed = BytesIO()
-    with zipfile.ZipFile(packed, "w") as archive:
-        for name, content in members.items():
-            member = zipfile.ZipInfo(name, _NO_TIME)
-            member.external_attr = _READ_BY_ALL
-            member.compress_type = zipfile.ZIP_DEFLATED
-            archive.writestr(member, content)
-    return packed.getvalue()
 
 
 def _exchange(fresh: Path, place: Path, names: list[str]) -> None:

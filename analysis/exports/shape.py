@@ -7,35 +7,23 @@ others read for the units; its `DataAttributes` name the columns of the table.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import shapefile
-import shapely
 
-from analysis.exports.output import zipped
+from companion.map_formats import shapefile_rings, shapefile_set, table_text, zipped
 
 if TYPE_CHECKING:
-    from shapely import MultiPolygon, Polygon
-
     from analysis.exports.columns import Column, Value
     from analysis.exports.output import Content
     from analysis.exports.source import Source
 
-# WGS84 in Esri's dialect, which the programs that read a .prj understand best (EPSG:4326).
-_PRJ = (
-    'GEOGCS["GCS_WGS_1984",DATUM["D_WGS_1984",SPHEROID["WGS_1984",6378137.0,298.257223563]],'
-    'PRIMEM["Greenwich",0.0],UNIT["Degree",0.0174532925199433]]'
-)
 _NUMBER_WIDTH = 18
-# The widest text column that dBASE III knows.
-_TEXT_WIDTH_MAX = 254
 # Some farm programs take twenty columns and no more; the companion's own clock means nothing there.
 _LEFT_OUT = ("FlightTime",)
-# Year since 1900, month and day of the last change: two runs give the same bytes.
-_DATE = bytes((100, 1, 1))
 
 
 def make(source: Source, out: Path) -> Content:
@@ -67,16 +55,9 @@ def _table(source: Source, columns: Sequence[Column]) -> dict[str, bytes]:
                 writer.record(*row)
         else:
             for ground, row in zip(source.swaths.polygons, rows, strict=True):
-                writer.poly(list(_rings(ground)))
+                writer.poly(shapefile_rings(ground))
                 writer.record(*row)
-    table = dbf.getvalue()
-    return {
-        ".cpg": b"UTF-8",
-        ".dbf": table[:1] + _DATE + table[4:],
-        ".prj": _PRJ.encode("ascii"),
-        ".shx": shx.getvalue(),
-        ".shp": shp.getvalue(),
-    }
+    return shapefile_set(shp=shp.getvalue(), shx=shx.getvalue(), dbf=dbf.getvalue())
 
 
 def _declared(writer: shapefile.Writer, column: Column) -> Sequence[Value]:
@@ -85,23 +66,10 @@ def _declared(writer: shapefile.Writer, column: Column) -> Sequence[Value]:
     if column.unit is not None:
         writer.field(column.short, "N", size=_NUMBER_WIDTH, decimal=column.unit.decimals)
         return values
-    texts = [_fitting(value) if isinstance(value, str) else "" for value in values]
+    texts = [table_text(value) if isinstance(value, str) else "" for value in values]
     size = max([1, *(len(text.encode()) for text in set(texts))])
     writer.field(column.short, "C", size=size)
     return texts
-
-
-def _fitting(text: str) -> str:
-    """Return a text cut between letters where it is wider than a column can be."""
-    return text.encode("utf-8", "replace")[:_TEXT_WIDTH_MAX].decode("utf-8", "ignore")
-
-
-def _rings(ground: Polygon | MultiPolygon) -> Iterator[list[list[float]]]:
-    """Yield all rings, the ground clockwise and its holes the other way (Esri, 1998)."""
-    turned = shapely.orient_polygons(ground, exterior_cw=True)
-    for part in shapely.get_parts(turned):
-        for ring in shapely.get_rings(part):
-            yield shapely.get_coordinates(ring).tolist()
 
 
 def _metadata(source: Source, columns: Sequence[Column]) -> bytes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -25,6 +24,7 @@ from companion.journal.continuing import Treated, rest_of, treated_ground_of
 from companion.journal.coverage import moved
 from companion.journal.reader import opened
 from companion.journal.writer import missing_rows
+from companion.map_formats import DEGREE_DECIMALS, geojson_feature, geojson_text
 
 M2_PER_HA = 10_000.0
 # The mean rate of the rest is taken at so many places of it.
@@ -117,7 +117,7 @@ def _result(
         "remaining_l": litres,
         "pieces": len(rest.geoms),
         "narrowest_m": 0.5 * last.strip_m,
-        "resume": None if stopped is None else {"lat": stopped[0], "lon": stopped[1]},
+        "resume": None if stopped is None else _place(*stopped),
         # Cut off: its last second is a guess; damaged: more was treated than could be read.
         "is_exact": all(flight.is_closed and not flight.unread for flight in flights),
         "training": [flight.training for flight in flights],
@@ -157,34 +157,34 @@ def _lines(result: Mapping[str, Any]) -> Iterator[str]:
         yield "a flight was cut off: its last second of spraying is worked out, not known"
 
 
+def _place(latitude_deg: float, longitude_deg: float) -> dict[str, float]:
+    """Return a place as it is written, too."""
+    return {
+        "lat": round(latitude_deg, DEGREE_DECIMALS),
+        "lon": round(longitude_deg, DEGREE_DECIMALS),
+    }
+
+
 def _write(out: Path, rest: MultiPolygon, frame: LocalFrame, result: Mapping[str, Any]) -> None:
     """Write the rest as polygons in longitude and latitude, and the place to go on from."""
 
     def there(places: np.ndarray[Any, np.dtype[np.float64]]) -> np.ndarray[Any, Any]:
         latitude, longitude = frame.to_geographic_all(places[:, 0].tolist(), places[:, 1].tolist())
-        return np.stack([np.round(longitude, 9), np.round(latitude, 9)], axis=1)
+        return np.stack([longitude, latitude], axis=1)
 
     features = [
-        {
-            "type": "Feature",
-            "properties": {"kind": "remaining", "area_m2": round(piece.area, 1)},
-            "geometry": shapely.geometry.mapping(
-                shapely.transform(shapely.orient_polygons(piece), there)
-            ),
-        }
+        geojson_feature(
+            shapely.transform(piece, there),
+            {"kind": "remaining", "area_m2": round(piece.area, 1)},
+        )
         for piece in rest.geoms
     ]
     place = result["resume"]
     if place is not None:
         features.append(
-            {
-                "type": "Feature",
-                "properties": {"kind": "resume"},
-                "geometry": {"type": "Point", "coordinates": [place["lon"], place["lat"]]},
-            }
+            geojson_feature(shapely.Point(place["lon"], place["lat"]), {"kind": "resume"})
         )
     try:
-        text = json.dumps({"type": "FeatureCollection", "features": features})
-        write_atomically(out, text.encode())
+        write_atomically(out, geojson_text(features).encode())
     except OSError as error:
         raise VrsprayError(f"{out}: cannot be written: {error}") from error

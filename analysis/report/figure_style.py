@@ -6,7 +6,6 @@ What all maps of a flight share: a sheet with panels of one extent, outlines, sc
 from __future__ import annotations
 
 import io
-import math
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,6 +19,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.transforms import ScaledTranslation
+
+from companion.map_pictures import draw_above
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -263,38 +264,13 @@ def dress(panel: Axes, sheet: Sheet, title: str, *, with_path: bool = False) -> 
     panel.set_title(title, pad=8)
     panel.set_xlabel("east [m]")
     panel.set_ylabel("north [m]")
-    _scale_and_north(panel, east - west)
-
-
-def _scale_and_north(panel: Axes, width_m: float) -> None:
-    """Draw a scale above the map's right corner, and say where north is."""
-    length_m = scale_m(width_m)
-    share = length_m / width_m
-    above = panel.get_xaxis_transform() + ScaledTranslation(0.0, 8 / 72, _inches(panel))
-    east_m = panel.get_xlim()[1]
-    west_m = east_m - length_m
-    panel.plot([west_m, east_m], [1.0, 1.0], color=INK, lw=2.5, transform=above, clip_on=False)
-    panel.text(
-        east_m - (share + 0.02) * width_m, 1.0, f"N \u2191  {length_m:g} m", transform=above,
-        ha="right", va="center", size=9.5,
-    )  # fmt: skip
+    draw_above(panel, panel.get_xaxis_transform() + ScaledTranslation(0, 8 / 72, _inches(panel)))
 
 
 def _inches(panel: Axes) -> Affine2DBase:
     figure = panel.get_figure(root=True)
     assert figure is not None
     return figure.dpi_scale_trans
-
-
-def scale_m(width_m: float) -> float:
-    """Return a round length, about a fifth of a width.
-
-    >>> scale_m(126.0), scale_m(48.0), scale_m(900.0)
-    (20.0, 5.0, 100.0)
-    """
-    wanted = width_m / 5.0
-    power = 10.0 ** math.floor(math.log10(wanted))
-    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= wanted)
 
 
 def _lines(

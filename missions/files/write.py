@@ -8,8 +8,19 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import escape
 
+import numpy as np
+import shapely
+
+from companion.map_formats import (
+    DEGREE_DECIMALS,
+    KML_HEAD,
+    KML_TAIL,
+    geojson_feature,
+    geojson_text,
+    kml_places,
+    kml_text,
+)
 from missions.errors import PlanError
 from missions.files.fence import Fences, fence_content
 from missions.files.items import (
@@ -86,9 +97,9 @@ def write_plan(
     check_suffix(out)
     suffix = out.suffix.casefold()
     if suffix == ".geojson":
-        texts = [geojson_text(plan)]
+        texts = [lines_text(plan)]
     elif suffix == ".kml":
-        texts = [kml_text(plan)]
+        texts = [plan_kml(plan)]
     elif suffix == ".plan":
         fences = fences or Fences(plan)
         texts = [
@@ -100,7 +111,7 @@ def write_plan(
     marks = lines_path(out)
     if marks is not None and marks not in paths:
         # First: whoever finds a mission finds its lines.
-        write_whole(marks, geojson_text(plan).encode("utf-8"))
+        write_whole(marks, lines_text(plan).encode("utf-8"))
     for path, text in zip(paths, texts, strict=True):
         write_whole(path, text.encode("utf-8"))
     return paths
@@ -143,11 +154,8 @@ def write_fleet(
 
 # The whole plan as GeoJSON: a line for each leg, a point for each depot.
 
-# 1e-9 degrees are 0.1 mm.
-DIGITS = 9
 
-
-def geojson_text(plan: Plan) -> str:
+def lines_text(plan: Plan) -> str:
     """Return the content of the file."""
     features = [
         _leg(plan, sortie, sequence, leg)
@@ -156,18 +164,18 @@ def geojson_text(plan: Plan) -> str:
         if leg.length_m > 0.0
     ]
     features += [_depot(plan, number, depot) for number, depot in enumerate(plan.depots, start=1)]
-    return json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False) + "\n"
+    return geojson_text(features)
 
 
 def _place(plan: Plan, place: Place) -> list[float]:
     latitude_deg, longitude_deg = plan.frame.to_geographic(*place)
-    return [round(longitude_deg, DIGITS), round(latitude_deg, DIGITS)]
+    return [longitude_deg, latitude_deg]
 
 
 def _leg(plan: Plan, sortie: Sortie, sequence: int, leg: Leg) -> dict[str, Any]:
-    return {
-        "type": "Feature",
-        "properties": {
+    return geojson_feature(
+        shapely.LineString([_place(plan, point) for point in leg.points]),
+        {
             "kind": leg.kind,
             "sortie": sortie.number,
             "sequence": sequence,
@@ -175,19 +183,11 @@ def _leg(plan: Plan, sortie: Sortie, sequence: int, leg: Leg) -> dict[str, Any]:
             "volume_l": round(leg.volume_l, 6),
             "height_m": plan.settings.height_m if leg.height_m is None else leg.height_m,
         },
-        "geometry": {
-            "type": "LineString",
-            "coordinates": [_place(plan, point) for point in leg.points],
-        },
-    }
+    )
 
 
 def _depot(plan: Plan, number: int, depot: Place) -> dict[str, Any]:
-    return {
-        "type": "Feature",
-        "properties": {"kind": "depot", "number": number},
-        "geometry": {"type": "Point", "coordinates": _place(plan, depot)},
-    }
+    return geojson_feature(shapely.Point(_place(plan, depot)), {"kind": "depot", "number": number})
 
 
 # The whole plan as KML, to look at: a folder for each sortie, a colour for each kind of leg.
@@ -199,33 +199,25 @@ def _depot(plan: Plan, number: int, depot: Place) -> dict[str, Any]:
 COLOURS = {"spray": "ff3ca03c", "transit": "ff00a5ff", "ferry": "ff3232dc"}
 
 
-def kml_text(plan: Plan) -> str:
+def plan_kml(plan: Plan) -> str:
     """Return the content of the file."""
     styles = [
         f'<Style id="{kind}"><LineStyle><color>{colour}</color><width>2</width></LineStyle></Style>'
         for kind, colour in COLOURS.items()
     ]
     folders = [
-        f"<Folder><name>{escape(f'Sortie {sortie.number}: {sortie.volume_l:.1f} L')}</name>"
+        f"<Folder><name>{kml_text(f'Sortie {sortie.number}: {sortie.volume_l:.1f} L')}</name>"
         + "".join(_kml_leg(plan, leg) for leg in sortie.legs if leg.length_m > 0.0)
         + "</Folder>"
         for sortie in plan.sorties
     ]
     depots = [
-        f"<Placemark><name>Depot {number}</name><Point><coordinates>{_kml_place(plan, depot)}"
-        "</coordinates></Point></Placemark>"
+        f"<Placemark><name>Depot {number}</name><Point><coordinates>"
+        f"{kml_places(np.array([_place(plan, depot)]))}</coordinates></Point></Placemark>"
         for number, depot in enumerate(plan.depots, start=1)
     ]
     body = "\n".join([*styles, *folders, *depots])
-    return (
-        '<?xml version="1.0" encoding="UTF-8"?>\n'
-        f'<kml xmlns="http://www.opengis.net/kml/2.2"><Document>\n{body}\n</Document></kml>\n'
-    )
-
-
-def _kml_place(plan: Plan, place: Place) -> str:
-    latitude_deg, longitude_deg = plan.frame.to_geographic(*place)
-    return f"{longitude_deg:.9f},{latitude_deg:.9f}"
+    return f"{KML_HEAD}<Document>\n{body}\n</Document>{KML_TAIL}"
 
 
 def _kml_leg(plan: Plan, leg: Leg) -> str:
@@ -241,7 +233,7 @@ def _kml_leg(plan: Plan, leg: Leg) -> str:
                 way.places.tolist(), way.ground_m.tolist(), strict=True
             )
         ]
-    line = " ".join(f"{_kml_place(plan, place)},{above_m:.2f}" for place, above_m in heights)
+    line = kml_places(np.array([[*_place(plan, place), above_m] for place, above_m in heights]))
     return (
         f"<Placemark><name>{leg.kind}</name><styleUrl>#{leg.kind}</styleUrl>"
         f"<LineString><altitudeMode>{mode}</altitudeMode>"
@@ -300,7 +292,7 @@ def _mode_of_all(items: Sequence[Item]) -> int:
 
 
 def _rounded(place: tuple[float, float]) -> list[float]:
-    return [round(place[0], DIGITS), round(place[1], DIGITS)]
+    return [round(value, DEGREE_DECIMALS) for value in place]
 
 
 def _simple(number: int, item: Item) -> dict[str, Any]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -22,6 +21,7 @@ from pyproj import CRS, Transformer
 
 from companion.core.frame import LocalFrame
 from companion.errors import MapError
+from companion.map_formats import geojson_feature, geojson_text
 from missions.make.cleaning import (
     STEPS,
     Cleaned,
@@ -355,18 +355,16 @@ def write_points(path: Path, points: Points) -> None:
         write_whole(path, text.getvalue().encode("utf-8"))
         return
     features = [
-        {
-            "type": "Feature",
-            "geometry": {"type": "Point", "coordinates": [round(lon, 8), round(lat, 8)]},
-            "properties": {
+        geojson_feature(
+            shapely.Point(lon, lat),
+            {
                 name: None if math.isnan(value) else value
                 for name, value in zip(names, values, strict=True)
             },
-        }
+        )
         for (lon, lat), *values in rows
     ]
-    found = {"type": "FeatureCollection", "features": features}
-    write_whole(path, json.dumps(found).encode("utf-8"))
+    write_whole(path, geojson_text(features).encode("utf-8"))
 
 
 def counts_text(found: Cleaned) -> str:

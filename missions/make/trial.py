@@ -7,8 +7,7 @@ strips the plots run as far as the field goes, side by side.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,6 +21,7 @@ from shapely.geometry.base import BaseGeometry
 from companion.atomic_write import write_atomically
 from companion.cli.answer import AsJson, Overrides, answer, note, problem_line, problem_object
 from companion.config import load
+from companion.map_formats import geojson_feature, geojson_text
 from companion.wording import counted
 from missions.errors import PlanError
 from missions.make.flown import (
@@ -289,9 +289,10 @@ def trial(
     map_file = _map_file(plots, design, field, target, rest)
     problems = problems_of(map_file, config, field)
     files = written(map_file, out, target, config, field, problems, writer.name, force=force)
-    text = _record(plots, design, field, rest, check=check is not None)
+    said = _said(design, field, rest, check=check is not None)
+    text = geojson_text(_features(plots, design, field), trial=said)
     try:
-        write_atomically(record, (json.dumps(text, indent=1) + "\n").encode())
+        write_atomically(record, text.encode())
     except OSError as error:
         raise not_written(record, error) from None
     if png is not None:
@@ -300,7 +301,7 @@ def trial(
     result = {
         "ok": ok,
         "files": [str(path) for path in (*files, record)],
-        **text["trial"],
+        **said,
         "problems": [problem_object(problem) for problem in problems],
         "plots": [
             {"plot": plot.number, "block": plot.block, "rate_l_ha": treatments[plot.treatment]}
@@ -342,45 +343,32 @@ def _map_file(
     )  # fmt: skip
 
 
-def _record(
-    plots: Sequence[Plot], design: Design, field: FlownField, rest: float, *, check: bool
-) -> dict[str, Any]:
-    """Return the trial as GeoJSON: its design, and a feature for each plot and its inner part."""
+def _said(design: Design, field: FlownField, rest_l_ha: float, *, check: bool) -> dict[str, Any]:
+    """Return what was laid out, as the record and the answer have it."""
+    return {
+        "version": VERSION,
+        "design": "strips" if design.plot_m is None else "plots",
+        "treatments_l_ha": list(design.rates_l_ha),
+        "check_l_ha": design.rates_l_ha[0] if check else None,
+        "rest_l_ha": rest_l_ha,
+        "blocks": design.blocks,
+        "seed": design.seed,
+        "course_deg": field.passes.angle_deg,
+        "settle_m": design.settle_m,
+        "guard_m": design.guard_m,
+        "speed_m_s": field.sprayer.speed_m_s,
+    }
 
-    def feature(plot: Plot, part: str, area: shapely.Polygon) -> dict[str, Any]:
-        return {
-            "type": "Feature",
-            "properties": {
+
+def _features(plots: Sequence[Plot], design: Design, field: FlownField) -> Iterator[dict[str, Any]]:
+    """Yield a feature for each plot and its inner part."""
+    for plot in plots:
+        for part, area in (("plot", plot.area()), ("inner", plot.inner(design))):
+            said = {
                 "plot": plot.number, "block": plot.block, "part": part,
                 "rate_l_ha": design.rates_l_ha[plot.treatment],
-            },
-            "geometry": json.loads(shapely.to_geojson(field.degrees(area))),
-        }  # fmt: skip
-
-    return {
-        "type": "FeatureCollection",
-        "trial": {
-            "version": VERSION,
-            "design": "strips" if design.plot_m is None else "plots",
-            "treatments_l_ha": list(design.rates_l_ha),
-            "check_l_ha": design.rates_l_ha[0] if check else None,
-            "rest_l_ha": rest,
-            "blocks": design.blocks,
-            "seed": design.seed,
-            "course_deg": field.passes.angle_deg,
-            "settle_m": design.settle_m,
-            "guard_m": design.guard_m,
-            "speed_m_s": field.sprayer.speed_m_s,
-        },
-        "features": [
-            one
-            for plot in plots
-            for one in (
-                feature(plot, "plot", plot.area()),
-                feature(plot, "inner", plot.inner(design)),
-            )
-        ],
-    }
+            }  # fmt: skip
+            yield geojson_feature(field.degrees(area), said)
 
 
 def _lines(result: dict[str, Any], plots: Sequence[Plot], design: Design) -> list[str]:

@@ -10,13 +10,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 from pyproj import CRS
 from shapely import MultiLineString, MultiPoint, MultiPolygon, Polygon
 from shapely.errors import ShapelyError
 from shapely.geometry.base import BaseGeometry
 
+from companion.map_formats import geojson_feature, geojson_geometry, geojson_text
 from missions.maps.bundle import Bundle, one_of, open_bundle
 from missions.maps.crs import WGS84, crs_name, parse_crs
 from missions.maps.local import BOUNDARY_NAME, Area, as_area, outline_of
@@ -352,8 +352,7 @@ def _ring(ring: list[list[float]]) -> NDArray[np.float64]:
 # A prescription as GeoJSON (RFC 7946).
 
 UNIT = "L/ha"
-# A tenth of a millimetre on the ground, and a millionth of a litre.
-_DEGREE_DECIMALS = 9
+# A millionth of a litre.
 _RATE_DECIMALS = 6
 
 
@@ -369,41 +368,11 @@ def write_geojson(
         raise map_error(
             path, "there is no zone to write", fix="take a map with zones", code="no-polygon"
         )
-    head = '{"type": "FeatureCollection",\n'
-    if boundary is not None:
-        head += f'"{BOUNDARY_NAME}": {_json(_geometry(boundary))},\n'
-    features = ",\n".join(_json(_feature(zone)) for zone in zones)
-    text = f'{head}"features": [\n{features}\n]}}\n'
+    beside = {} if boundary is None else {BOUNDARY_NAME: geojson_geometry(boundary)}
+    text = geojson_text(map(_feature, zones), **beside)
     write_whole(path, text.encode("utf-8", "replace"))
 
 
 def _feature(zone: MapZone) -> dict[str, object]:
     rate = None if zone.rate_l_ha is None else round(zone.rate_l_ha, _RATE_DECIMALS)
-    return {
-        "type": "Feature",
-        "properties": {"name": zone.name, "rate": rate, "unit": UNIT},
-        "geometry": _geometry(zone.geometry),
-    }
-
-
-def _geometry(geometry: Polygon | MultiPolygon) -> dict[str, object]:
-    """Return a geometry whose shells turn anticlockwise (RFC 7946, section 3.1.6)."""
-    turned = shapely.orient_polygons(geometry, exterior_cw=False)
-    parts = [
-        [_written_positions(ring) for ring in shapely.get_rings(part)]
-        for part in shapely.get_parts(turned)
-    ]
-    if isinstance(geometry, Polygon):
-        return {"type": "Polygon", "coordinates": parts[0]}
-    return {"type": "MultiPolygon", "coordinates": parts}
-
-
-def _written_positions(ring: shapely.LinearRing) -> list[list[float]]:
-    positions: list[list[float]] = np.round(
-        shapely.get_coordinates(ring), _DEGREE_DECIMALS
-    ).tolist()
-    return positions
-
-
-def _json(value: object) -> str:
-    return json.dumps(value, ensure_ascii=False, allow_nan=False)
+    return geojson_feature(zone.geometry, {"name": zone.name, "rate": rate, "unit": UNIT})

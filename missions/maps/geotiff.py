@@ -14,7 +14,6 @@ corner of the first cell, the world file its centre.
 from __future__ import annotations
 
 import struct
-import zipfile
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,10 +22,10 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 import shapefile
-import shapely
 from pyproj import CRS
 from shapely import MultiPolygon
 
+from companion.map_formats import shapefile_rings, shapefile_set, zipped
 from missions.maps.adapt import Operation, described_beside
 from missions.maps.bundle import Bundle, files_beside, one_of, open_bundle
 from missions.maps.dbf import find_shapefile
@@ -292,8 +291,6 @@ def _boundary(
 
 NODATA = -9999.0
 _ROOT = "DJI"
-# What a dBASE file says of its last change, and the oldest date of a zip: two runs give the same.
-_DBF_DATE, _ZIP_DATE = b"\x64\x01\x01", (1980, 1, 1, 0, 0, 0)
 
 
 def write_geotiff(cells: MapCells, path: Path, *, boundary: MultiPolygon | None = None) -> None:
@@ -309,8 +306,8 @@ def write_geotiff(cells: MapCells, path: Path, *, boundary: MultiPolygon | None 
 
 def write_dji(cells: MapCells, path: Path, boundary: MultiPolygon | None = None) -> None:
     """Write DJI's package: a zip where the name ends in `.zip`, else a folder."""
-    zipped = path.suffix.casefold() == ".zip"
-    name = path.stem if zipped else path.name
+    is_zip = path.suffix.casefold() == ".zip"
+    name = path.stem if is_zip else path.name
     a, b, _, d, _, _ = cells.transform
     if cells.crs.to_epsg() != 4326 or not (a > 0.0 and b == d == 0.0):
         raise ValueError("cells for DJI need longitude and latitude along their edges")
@@ -320,8 +317,8 @@ def write_dji(cells: MapCells, path: Path, boundary: MultiPolygon | None = None)
     if boundary is not None:
         shape = _shapefile(boundary, path)
         files |= {f"{_ROOT}/{SHAPE_FOLDER}/{name}{end}": part for end, part in shape.items()}
-    if zipped:
-        write_whole(path, _zipped(files))
+    if is_zip:
+        write_whole(path, zipped(dict(sorted(files.items()))))
         return
     # The picture last: without it the folder is no map.
     for place, content in sorted(files.items(), reverse=True):
@@ -379,18 +376,12 @@ def _tiff(
 
 
 def _shapefile(boundary: MultiPolygon, path: Path) -> dict[str, bytes]:
-    """Return the files of a shapefile with one record, clockwise outside as its rules have it."""
-    polygons = shapely.orient_polygons(boundary, exterior_cw=True)
-    rings = [
-        [(x, y) for x, y, *_ in ring.coords]
-        for polygon in polygons.geoms
-        for ring in (polygon.exterior, *polygon.interiors)
-    ]
+    """Return the files of a shapefile with one record."""
     shp, shx, dbf = BytesIO(), BytesIO(), BytesIO()
     try:
         with shapefile.Writer(shp=shp, shx=shx, dbf=dbf, shapeType=shapefile.POLYGON) as writer:
             writer.field("name", "C", size=16)
-            writer.poly(rings)
+            writer.poly(shapefile_rings(boundary))
             writer.record("boundary")
     except (shapefile.ShapefileException, struct.error, ValueError) as error:
         raise map_error(
@@ -399,22 +390,5 @@ def _shapefile(boundary: MultiPolygon, path: Path) -> dict[str, bytes]:
             fix="give a boundary with an area",
             code="broken-geometry",
         ) from None
-    table = dbf.getvalue()
-    return {
-        ".shp": shp.getvalue(),
-        ".shx": shx.getvalue(),
-        ".dbf": table[:1] + _DBF_DATE + table[4:],
-        ".prj": CRS.from_epsg(4326).to_wkt("WKT1_ESRI").encode("ascii"),
-    }
-
-
-def _zipped(files: dict[str, bytes]) -> bytes:
-    buffer = BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in sorted(files.items()):
-            member = zipfile.ZipInfo(name, _ZIP_DATE)
-            member.compress_type = zipfile.ZIP_DEFLATED
-            # Unix, and readable: else the members depend on the system that packs them.
-            member.create_system, member.external_attr = 3, 0o644 << 16
-            archive.writestr(member, content)
-    return buffer.getvalue()
+    found = shapefile_set(shp=shp.getvalue(), shx=shx.getvalue(), dbf=dbf.getvalue())
+    return {end: content for end, content in found.items() if end != ".cpg"}

@@ -6,20 +6,16 @@ text of a description is for people: no rate is read out of it.
 
 from __future__ import annotations
 
-import re
-import zipfile
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 from xml.etree.ElementTree import Element
-from xml.sax.saxutils import escape
 
-import shapely
-from shapely import LinearRing, MultiPolygon, Polygon
+from shapely import MultiPolygon, Polygon
 
+from companion.map_formats import KML_HEAD, KML_TAIL, kml_colour, kml_ground, kml_text, zipped
 from missions.maps.bundle import MAX_ELEMENTS, Bundle, open_bundle, parse_xml
 from missions.maps.crs import WGS84
 from missions.maps.fields import column_of, stated_unit
@@ -431,17 +427,7 @@ _NO_RATE = "none"
 # 1e-12 degrees are a ten-thousandth of a millimetre.
 _COORDINATE_DECIMALS = 12
 _RATE_DECIMALS = 6
-# What XML 1.0 cannot hold, not even as a reference (section 2.2).
-_FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-# The oldest date that a zip can state: two runs give the same bytes.
-_ZIP_DATE = (1980, 1, 1, 0, 0, 0)
-_ZIP_UNIX, _ZIP_RIGHTS = 3, 0o644 << 16
-
-_HEAD = """<?xml version="1.0" encoding="UTF-8"?>
-<kml xmlns="http://www.opengis.net/kml/2.2">
-<Document>
-<name>prescription</name>
-"""
+_HEAD = f"{KML_HEAD}<Document>\n<name>prescription</name>\n"
 # A document in the document: a schema belongs to one (section 9.7), and GDAL looks for the schema
 # of a layer in an archive nowhere else.
 _ZONES_HEAD = """<Document>
@@ -462,7 +448,7 @@ def write_kml(
     for it: many programs read an empty one as 0.
     """
     content = "".join(_document(zones, boundary)).encode()
-    write_whole(path, _zipped(content) if path.suffix.casefold() == ".kmz" else content)
+    write_whole(path, zipped({"doc.kml": content}) if path.suffix.casefold() == ".kmz" else content)
 
 
 def _document(zones: Sequence[MapZone], boundary: MultiPolygon | None) -> Iterator[str]:
@@ -477,16 +463,15 @@ def _document(zones: Sequence[MapZone], boundary: MultiPolygon | None) -> Iterat
     if boundary is not None:
         yield f"<Folder>\n<name>{BOUNDARY_NAME}</name>\n<Placemark>\n<name>{BOUNDARY_NAME}</name>\n"
         yield f"<styleUrl>#{BOUNDARY_NAME}</styleUrl>\n"
-        yield from _geometry(boundary)
+        yield f"{_ground(boundary)}\n"
         yield "</Placemark>\n</Folder>\n"
-    yield "</Document>\n</kml>\n"
+    yield f"</Document>\n{KML_TAIL}"
 
 
 def _styles() -> Iterator[str]:
-    """Yield a style for every colour of the ramp; KML writes alpha, blue, green, red."""
-    for index, (red, green, blue) in enumerate(_RAMP):
-        colour = f"c0{blue:02x}{green:02x}{red:02x}"
-        yield _shape_style(f"rate{index}", f"<color>{colour}</color>")
+    """Yield a style for every colour of the ramp."""
+    for index, colour in enumerate(_RAMP):
+        yield _shape_style(f"rate{index}", f"<color>{kml_colour(colour, opacity='c0')}</color>")
     yield _shape_style(_NO_RATE, "<color>40808080</color>")
     yield _shape_style(BOUNDARY_NAME, "<fill>0</fill>")
 
@@ -506,38 +491,19 @@ def _style(rate_l_ha: float | None, least: float, most: float) -> str:
 
 
 def _placemark(zone: MapZone, style: str) -> Iterator[str]:
-    yield f"<Placemark>\n<name>{escape(_FORBIDDEN.sub(' ', zone.name))}</name>\n"
+    yield f"<Placemark>\n<name>{kml_text(zone.name)}</name>\n"
     yield f"<styleUrl>#{style}</styleUrl>\n"
     yield '<ExtendedData><SchemaData schemaUrl="#prescription">\n'
     if zone.rate_l_ha is not None:
         rate = _decimal(zone.rate_l_ha, _RATE_DECIMALS)
         yield f'<SimpleData name="rate">{rate}</SimpleData>\n'
     yield '<SimpleData name="unit">L/ha</SimpleData>\n</SchemaData></ExtendedData>\n'
-    yield from _geometry(zone.geometry)
+    yield f"{_ground(zone.geometry)}\n"
     yield "</Placemark>\n"
 
 
-def _geometry(area: Polygon | MultiPolygon) -> Iterator[str]:
-    """Yield the polygons, the outside of each anticlockwise as KML wants it."""
-    parts = shapely.get_parts(shapely.orient_polygons(area)).tolist()
-    if len(parts) > 1:
-        yield "<MultiGeometry>\n"
-    for part in parts:
-        yield "<Polygon>\n"
-        yield _side("outerBoundaryIs", part.exterior)
-        for hole in part.interiors:
-            yield _side("innerBoundaryIs", hole)
-        yield "</Polygon>\n"
-    if len(parts) > 1:
-        yield "</MultiGeometry>\n"
-
-
-def _side(side: str, ring: LinearRing) -> str:
-    positions = " ".join(
-        f"{_decimal(longitude, _COORDINATE_DECIMALS)},{_decimal(latitude, _COORDINATE_DECIMALS)}"
-        for longitude, latitude in shapely.get_coordinates(ring).tolist()
-    )
-    return f"<{side}><LinearRing><coordinates>{positions}</coordinates></LinearRing></{side}>\n"
+def _ground(area: Polygon | MultiPolygon) -> str:
+    return kml_ground(area, decimals=_COORDINATE_DECIMALS)
 
 
 def _decimal(value: float, decimals: int) -> str:
@@ -547,13 +513,3 @@ def _decimal(value: float, decimals: int) -> str:
     ('12.5', '100', '0.00001')
     """
     return f"{value:.{decimals}f}".rstrip("0").rstrip(".")
-
-
-def _zipped(content: bytes) -> bytes:
-    entry = zipfile.ZipInfo("doc.kml", _ZIP_DATE)
-    entry.compress_type = zipfile.ZIP_DEFLATED
-    entry.create_system, entry.external_attr = _ZIP_UNIX, _ZIP_RIGHTS
-    buffer = BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        archive.writestr(entry, content)
-    return buffer.getvalue()

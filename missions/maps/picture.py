@@ -7,10 +7,9 @@ what would be sprayed: the default rate as ground of its own, nothing beyond the
 from __future__ import annotations
 
 import importlib.util
-import math
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from shapely.errors import ShapelyError
 
 from companion.core.frame import LocalFrame
+from companion.map_pictures import draw_below
 from companion.wording import install_command
 from missions.maps.build import frame_for
 from missions.maps.cells import bounds_deg
@@ -27,7 +27,6 @@ from missions.maps.totals import Totals, as_sprayed, totals
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from missions.maps.picture_ground import Colours
@@ -38,6 +37,7 @@ DPI = 100
 _MAP_MAX_IN, _MAP_MIN_IN = (11.6, 10.0), (5.0, 4.0)
 _LEFT_IN, _RIGHT_IN, _BELOW_IN, _ABOVE_IN = 0.4, 4.0, 0.9, 1.1
 _FONT = "DejaVu Sans"  # comes with matplotlib
+STYLE: dict[Any, Any] = {"font.family": _FONT, "svg.hashsalt": "vrspray"}
 # No date and no version in the file: the same map makes the same bytes.
 _METADATA: dict[str, dict[str, str | None]] = {
     ".png": {"Software": None},
@@ -95,11 +95,16 @@ def _drawn(map_file: MapFile, title: str, suffix: str) -> tuple[bytes, Totals]:
     sprayed = as_sprayed(map_file)
     frame = frame_for(sprayed)
     found = totals(map_file, frame=frame)
-    with rc_context({"font.family": _FONT, "svg.hashsalt": "vrspray", "hatch.linewidth": 0.6}):
+    with rc_context(STYLE | {"hatch.linewidth": 0.6}):
         figure = _figure(sprayed, frame, found, title)
-        content = BytesIO()
-        figure.savefig(content, format=suffix[1:], dpi=DPI, metadata=_METADATA[suffix])
-    return content.getvalue(), found
+        return content_of(figure, suffix, dpi=DPI), found
+
+
+def content_of(figure: Figure, suffix: str, *, dpi: float) -> bytes:
+    """Return a figure as PNG, SVG or PDF: the same figure makes the same bytes."""
+    content = BytesIO()
+    figure.savefig(content, format=suffix[1:], dpi=dpi, metadata=_METADATA[suffix])
+    return content.getvalue()
 
 
 def _figure(map_file: MapFile, frame: LocalFrame, found: Totals, title: str) -> Figure:
@@ -127,8 +132,7 @@ def _figure(map_file: MapFile, frame: LocalFrame, found: Totals, title: str) -> 
     )  # fmt: skip
     axes.set_xlim(west, east)
     axes.set_ylim(south, north)
-    _scale(axes, sheet)
-    _north(axes, sheet)
+    draw_below(axes, sheet.map_in[1])
     _title(figure, sheet, frame, found, title)
     draw_legend(
         figure,
@@ -174,50 +178,6 @@ def _bounds_m(map_file: MapFile, frame: LocalFrame) -> tuple[float, float, float
     local = project_all(np.array(areas, dtype=object), frame)
     west, south, east, north = shapely.total_bounds(local).tolist()
     return west, south, east, north
-
-
-def scale_length_m(width_m: float) -> float:
-    """Return a round length of at most a quarter of the picture's width.
-
-    >>> scale_length_m(950.0), scale_length_m(72.0)
-    (200.0, 10.0)
-    """
-    most = width_m / 4.0
-    power = 10.0 ** math.floor(math.log10(most))
-    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= most)
-
-
-def _scale(axes: Axes, sheet: Sheet) -> None:
-    west, _, east, _ = sheet.ground_m
-    length = scale_length_m(east - west)
-    across = axes.get_xaxis_transform()  # x in metres, y as a share of the map's height
-    down = 0.28 / sheet.map_in[1]
-    for start, end, colour in ((0.0, 0.5, "black"), (0.5, 1.0, "white")):
-        axes.fill_between(
-            [west + start * length, west + end * length], -down, -down - 0.09 / sheet.map_in[1],
-            transform=across, facecolor=colour, edgecolor="black", linewidth=0.8, clip_on=False,
-        )  # fmt: skip
-    text = f"{length / 1000:g} km" if length >= 1000.0 else f"{length:g} m"
-    for share, label, align in ((0.0, "0", "left"), (1.0, text, "center")):
-        axes.text(
-            west + share * length, -down - 0.14 / sheet.map_in[1], label,
-            transform=across, ha=align, va="top", fontsize=11,
-        )  # fmt: skip
-
-
-def _north(axes: Axes, sheet: Sheet) -> None:
-    high_in = sheet.map_in[1]
-    axes.annotate(
-        "N",
-        xy=(0.97, -0.1 / high_in),
-        xytext=(0.97, -0.72 / high_in),
-        xycoords="axes fraction",
-        ha="center",
-        fontsize=13,
-        fontweight="bold",
-        arrowprops={"facecolor": "black", "width": 3.0, "headwidth": 10.0, "headlength": 10.0},
-        annotation_clip=False,
-    )
 
 
 def _title(figure: Figure, sheet: Sheet, frame: LocalFrame, found: Totals, title: str) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import struct
-import zipfile
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -25,6 +24,7 @@ from shapely import MultiLineString, MultiPoint, MultiPolygon, Polygon, STRtree
 from shapely.errors import ShapelyError
 from shapely.geometry.base import BaseGeometry
 
+from companion.map_formats import shapefile_rings, shapefile_set, table_text, zipped
 from missions.maps.crs import parse_crs
 from missions.maps.dbf import ShapeFiles, find_shapefile, read_columns
 from missions.maps.local import BOUNDARY_NAME, Area, as_area
@@ -471,16 +471,6 @@ def _attributes(metadata: bytes) -> list[tuple[str, str]]:
 UNIT = "L/ha"
 # Four decimals hold a rate to a ten-thousandth of a litre; the core's limit is 100 000 L/ha.
 _RATE_WIDTH, _RATE_DECIMALS = 12, 4
-# The widest text column that dBASE III knows.
-_TEXT_WIDTH_MAX = 254
-# WGS84 in Esri's dialect, which the programs that read a .prj understand best (EPSG:4326).
-_PRJ = (
-    'GEOGCS["GCS_WGS_1984",DATUM["D_WGS_1984",SPHEROID["WGS_1984",6378137.0,298.257223563]],'
-    'PRIMEM["Greenwich",0.0],UNIT["Degree",0.0174532925199433]]'
-)
-# Year since 1900, month and day of the last change: two runs give the same bytes.
-_DATE = bytes((100, 1, 1))
-_ZIP_DATE = (2000, 1, 1, 0, 0, 0)
 
 
 def write_shapefile(
@@ -504,7 +494,7 @@ def write_shapefile(
                 f"{BOUNDARY_NAME}/{BOUNDARY_NAME}{suffix}": one
                 for suffix, one in _files([outline]).items()
             }
-        write_whole(path, _zipped(members))
+        write_whole(path, zipped(dict(sorted(members.items()))))
         return
     # The .shp goes first and comes last: what there is without it is no map to anybody.
     try:
@@ -526,39 +516,11 @@ def _files(zones: Sequence[MapZone]) -> dict[str, bytes]:
         writer.field("rate", "N", size=_RATE_WIDTH, decimal=_RATE_DECIMALS)
         writer.field("unit", "C", size=len(UNIT))
         for name, zone in zip(names, zones, strict=True):
-            writer.poly(_written_rings(zone.geometry))
+            writer.poly(shapefile_rings(zone.geometry))
             writer.record(name, zone.rate_l_ha, UNIT)
-    table = dbf.getvalue()
-    return {
-        ".cpg": b"UTF-8",
-        ".dbf": table[:1] + _DATE + table[4:],
-        ".prj": _PRJ.encode("ascii"),
-        ".shp": shp.getvalue(),
-        ".shx": shx.getvalue(),
-    }
-
-
-def _written_rings(geometry: Polygon | MultiPolygon) -> list[list[list[float]]]:
-    """Return all rings, the ground clockwise and its holes the other way (Esri, 1998)."""
-    turned = shapely.orient_polygons(geometry, exterior_cw=True)
-    return [
-        shapely.get_coordinates(ring).tolist()
-        for part in shapely.get_parts(turned)
-        for ring in shapely.get_rings(part)
-    ]
+    return shapefile_set(shp=shp.getvalue(), shx=shx.getvalue(), dbf=dbf.getvalue())
 
 
 def _fitting(name: str) -> str:
     """Return a name on one line, cut between letters where it is wider than a column can be."""
-    plain = " ".join(name.replace("\0", " ").split()).encode("utf-8", "replace")
-    return plain[:_TEXT_WIDTH_MAX].decode("utf-8", "ignore").rstrip()
-
-
-def _zipped(members: dict[str, bytes]) -> bytes:
-    content = BytesIO()
-    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name in sorted(members):
-            entry = zipfile.ZipInfo(name, _ZIP_DATE)
-            entry.compress_type = zipfile.ZIP_DEFLATED
-            archive.writestr(entry, members[name])
-    return content.getvalue()
+    return table_text(" ".join(name.replace("\0", " ").split())).rstrip()

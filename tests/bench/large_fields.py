@@ -27,7 +27,7 @@ from shapely.geometry.base import BaseGeometry
 from missions.demand import Uniform
 from missions.energy import Battery
 from missions.field import Field, build_field
-from missions.files.write import geojson_text
+from missions.files.write import lines_text
 from missions.plan import Settings
 from missions.planner import plan_mission
 from tests.bench.parcels import read_parcel
@@ -97,7 +97,7 @@ def compared(
     begun = process_time()
     plan = plan_mission(field, settings, Uniform(rate_l_ha=RATE_L_HA), depots=(depot,))
     took_s = process_time() - begun
-    sorties = legs_of(drawn, json.loads(geojson_text(plan)))
+    sorties = legs_of(drawn, json.loads(lines_text(plan)))
     endless = in_one(drawn, field, depot)
     ((home_x, home_y),) = drawn.plane.metres(np.array([[depot[1], depot[0]]]))
     home = float(home_x), float(home_y)
@@ -146,7 +146,7 @@ def in_one(drawn: Drawn, field: Field, depot: tuple[float, float]) -> Any:
         swath_width_m=drawn.width_m, speed_m_s=FLIGHT.speed_m_s, tank_l=99_999.0, reserve_l=0.0
     )
     plan = plan_mission(field, settings, Uniform(rate_l_ha=RATE_L_HA), depots=(depot,))
-    return legs_of(drawn, json.loads(geojson_text(plan)))
+    return legs_of(drawn, json.loads(lines_text(plan)))
 
 
 def main() -> int:

@@ -27,7 +27,7 @@ from analysis.border import off_target_ml
 from analysis.strips import strips_of
 from companion.config import Config, load
 from companion.core.setup import Setup
-from missions.files.write import geojson_text
+from missions.files.write import lines_text
 from missions.maps.compiling import compiled_setup
 from missions.plan import Plan, Sortie
 from missions.planner import plan_mission
@@ -62,7 +62,7 @@ def planned(config: Config, boundary: Path, *, moves: int = MOVES, **changes: An
 def with_lines(plan: Plan, config: Config) -> Config:
     """Return the configuration that sprays on the plan's lines only, its file beside it."""
     path = config.path.parent / "plan.lines.geojson"
-    path.write_text(geojson_text(plan))
+    path.write_text(lines_text(plan))
     return load(config.path, overrides=[f'mission.lines="{path}"'])
 
 

@@ -30,7 +30,7 @@ from missions.fewer_corners import (
 from missions.field import Field, build_field
 from missions.files.fence import Fences, fence_warnings
 from missions.files.items import FENCE_CORNERS_MAX
-from missions.files.write import geojson_text, plan_text
+from missions.files.write import lines_text, plan_text
 from missions.free_space import CORNERS_MAX, free_space
 from missions.layouts import spray_lines
 from missions.maps.local import make_valid
@@ -115,7 +115,7 @@ def test_simpler_borders_leave_enough_of_small_fields(kind: str, seed: int) -> N
     made = parcel(kind, seed)
     drawn = Drawn(outline=made.outline, obstacles=made.obstacles)
     plan = plan_mission(field_of(drawn), SETTINGS, Uniform(rate_l_ha=20.0))
-    found = judge(drawn, json.loads(geojson_text(plan)), speed_m_s=6.0, a_m_s2=2.5)
+    found = judge(drawn, json.loads(lines_text(plan)), speed_m_s=6.0, a_m_s2=2.5)
     assert found["reachable_percent"] >= 99.8
     assert found["off_m2"] == 0.0
 
@@ -200,7 +200,7 @@ def planned(drawn: Drawn) -> Plan:
 
 
 def geojson_of(plan: Plan) -> dict[str, object]:
-    found: dict[str, object] = json.loads(geojson_text(plan))
+    found: dict[str, object] = json.loads(lines_text(plan))
     return found
 
 

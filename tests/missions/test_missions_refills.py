@@ -17,7 +17,7 @@ from missions.corners import Motion
 from missions.demand import Uniform, demands
 from missions.energy import Battery
 from missions.field import build_field
-from missions.files.write import geojson_text
+from missions.files.write import lines_text
 from missions.free_space import free_space
 from missions.passes import Part, Passes, Times
 from missions.plan import Plan, Settings
@@ -245,7 +245,7 @@ def test_the_bound_beside_a_plan_is_that_of_the_judge() -> None:
     where = depots_of(drawn)["corner"]
     plan = planned(drawn, where, tank_l=6.0)
     said_m = sheet(plan)["least_idle_m"]
-    legs = legs_of(drawn, json.loads(geojson_text(plan)))
+    legs = legs_of(drawn, json.loads(lines_text(plan)))
     passes = [each for sortie in legs.values() for each in passes_in(sortie)]
     ((x, y),) = drawn.plane.metres(np.array([[where[1], where[0]]]))
     home = (float(x), float(y))
@@ -256,5 +256,5 @@ def test_the_bound_beside_a_plan_is_that_of_the_judge() -> None:
 def test_the_same_seed_gives_the_same_sorties() -> None:
     drawn = field_of(12.0)
     depot = depots_of(drawn)["middle"]
-    first, second = (geojson_text(planned(drawn, depot, tank_l=6.0)) for _ in range(2))
+    first, second = (lines_text(planned(drawn, depot, tank_l=6.0)) for _ in range(2))
     assert json.loads(first) == json.loads(second)

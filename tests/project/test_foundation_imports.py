@@ -183,3 +183,17 @@ def test_a_function_says_its_lines_without_signature_and_docstring(tmp_path: Pat
     assert rules.long_functions({"long": file})[0] == "long.A.b: 61 lines, more than 60"
     file.write_text("\n".join(lines[:-1]))
     assert not any(line.startswith("long.A.b") for line in rules.long_functions({"long": file}))
+
+
+def test_what_a_module_keeps_to_itself_is_imported_nowhere_else(tmp_path: Path) -> None:
+    file = tmp_path / "user.py"
+    file.write_text(
+        "from __future__ import annotations\nfrom typing import _alias\n"
+        "from companion.cli import __main__, app\nimport companion.link._wire as wire\n"
+        "def late():\n    from missions.plan import _legs\n"
+    )
+    assert rules.private_imports({"user": file}) == [
+        "user: imports companion.link._wire, which is private",
+        "user: imports missions.plan._legs, which is private",
+    ]
+    assert rules.private_imports(rules.modules()) == []

@@ -9,11 +9,9 @@ close the nozzles as before.
 from __future__ import annotations
 
 import shutil
-import zipfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
-from io import BytesIO
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
@@ -22,13 +20,12 @@ import shapely
 from shapely import MultiPolygon, Polygon
 from shapely.errors import ShapelyError
 
+from companion.map_formats import zipped
 from missions.maps.local import frame_around, polygons_of, project
 from missions.maps.model import MapCells, MapFile, MapZone, map_error, not_written, write_whole
 
 GRID_NAME = "GRD00001"
 _TASK_DATA = "TASKDATA.XML"
-# A zip has times of its members; the earliest it can hold makes the same bytes every time.
-_NO_TIME = (1980, 1, 1, 0, 0, 0)
 
 
 def write_isoxml(map_file: MapFile, path: Path) -> None:
@@ -103,17 +100,10 @@ def _add_grid(task: Element, cells: MapCells, default_raw: int, path: Path) -> b
 
 def _zipped(task_data: bytes, grid: bytes | None) -> bytes:
     """Return a zip with a folder TASKDATA, as terminals look for on a stick."""
-    members = [(_TASK_DATA, task_data), *([(f"{GRID_NAME}.BIN", grid)] if grid else [])]
-    buffer = BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        for name, content in members:
-            member = zipfile.ZipInfo(f"TASKDATA/{name}", _NO_TIME)
-            member.external_attr = 0o644 << 16
-            # A grid of a few rates would shrink so much that it looks like a zip bomb.
-            packed = name == _TASK_DATA
-            member.compress_type = zipfile.ZIP_DEFLATED if packed else zipfile.ZIP_STORED
-            archive.writestr(member, content)
-    return buffer.getvalue()
+    members = {_TASK_DATA: task_data} | ({f"{GRID_NAME}.BIN": grid} if grid else {})
+    folder = {f"TASKDATA/{name}": content for name, content in members.items()}
+    # A grid of a few rates would shrink so much that it looks like a zip bomb.
+    return zipped(folder, as_is=[name for name in folder if name.endswith(".BIN")])
 
 
 def _write_files(path: Path, task_data: bytes, grid: bytes | None) -> None:
