@@ -50,11 +50,11 @@ HoldLines = Annotated[
 ]
 Keep = Annotated[
     Path | None,
-    typer.Option(metavar="FILE", help="Keep what was recorded (JSON), to evaluate it again."),
+    typer.Option(metavar="FILE", help="Keep the record (JSON), to evaluate it again."),
 ]
 Record = Annotated[
     Path | None,
-    typer.Option("--from", metavar="FILE", help="Evaluate such a record; nothing is opened."),
+    typer.Option("--from", metavar="FILE", help="Evaluate a record kept by --out; opens no valve."),
 ]
 
 MS = 1000.0
@@ -160,7 +160,7 @@ class CountRecorder:
             return told
         for before, after in pairwise(counts):
             if not after.volume_ml >= before.volume_ml:
-                return "flow meter: the autopilot's count has begun anew"
+                return "flow meter: the autopilot's count has restarted"
             if not after.received_s - before.received_s <= COUNT_GAP_S:
                 gap_s = after.received_s - before.received_s
                 return f"flow meter: no count of the autopilot for {gap_s:.1f} s"
@@ -170,13 +170,13 @@ class CountRecorder:
 def valves(
     config_file: ConfigFile,
     cycles: Annotated[
-        int, typer.Option(min=6, max=200, help="How often each kind of change is made of a valve.")
+        int, typer.Option(min=6, max=200, help="How often each valve makes each kind of change.")
     ] = CYCLES,
     is_among: Annotated[
         bool,
         typer.Option(
             "--others-open",
-            help="The other valves spray meanwhile: where one alone is too little for the meter.",
+            help="Leave the other valves open: for a meter that cannot read one alone.",
         ),
     ] = False,
     is_lines: HoldLines = False,
@@ -194,7 +194,7 @@ def valves(
     is_write: Write = False,
     as_json: AsJson = False,
 ) -> None:
-    """Measure each valve by itself: its flow and its lags.
+    """Measure the flow and the lags of each valve.
 
     With water, disarmed, on the ground, while you hold a key. Exit 1: the measurement failed.
 
@@ -308,16 +308,7 @@ def measuring(
         task = replace(task, drives=drives_while(config, range(len(config.valve)), most))
         outcome = perform(config, given, task, hand, sensors=sensors, on_step=on_step, hear=hear)
         if outcome.has_begun:
-            entry = {
-                "ended_utc": datetime.now(UTC).isoformat(),
-                "kind": str(task.kind),
-                "open_s": round(outcome.open_s, 4),
-                "is_done": outcome.is_done,
-                "reasons": sorted(str(reason) for reason in outcome.reasons),
-                "training": "ground",
-                "liquid": "water",
-            }
-            trouble = append(log, entry)
+            trouble = append(log, _logged(task, outcome))
             if trouble is not None:
                 note(f"warning: {trouble}")
         if INTERRUPTED in outcome.reasons:
@@ -335,6 +326,19 @@ def measuring(
         )
 
     return measure
+
+
+def _logged(task: GroundTask, outcome: GroundOutcome) -> dict[str, Any]:
+    """Return what the log of ground work keeps of a piece."""
+    return {
+        "ended_utc": datetime.now(UTC).isoformat(),
+        "kind": str(task.kind),
+        "open_s": round(outcome.open_s, 4),
+        "is_done": outcome.is_done,
+        "reasons": sorted(str(reason) for reason in outcome.reasons),
+        "training": "ground",
+        "liquid": "water",
+    }
 
 
 def _as_it_is(link: GroundLink) -> GroundLink:
@@ -450,7 +454,7 @@ def read_json(path: Path, names: Sequence[str], kind: str) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise ConfigError(f"--from {path}: cannot be read ({error})") from error
     if not isinstance(document, dict) or document.get("format") != kind:
-        raise ConfigError(f"--from {path}: is no record that --out has written")
+        raise ConfigError(f"--from {path}: is not a record that --out wrote")
     if document.get("valves") != list(names):
         raise ConfigError(f"--from {path}: is of other valves than the configuration has")
     return document

@@ -23,10 +23,6 @@ LINES_MAX = 600
 EXCEPTIONS: dict[str, str] = {
     "analysis.journals.salvage": "what is done to a journal, apart from the command line",
     "analysis.journals.stray_rows": "what a page may be of; pure, apart from the copy it serves",
-    "companion.output.hardware_pwm": "one output a file",
-    "missions.make.zones": "the optimum along a pass, apart from what it is of; pure",
-    "missions.worth": "its price of a layout is another than the one that the layouts share",
-    "sitl.stub.actions": "knows both firmwares' commands, which know the autopilot's protocol",
 }
 # Longer than 600 lines, to be cut; nothing is added here.
 TOO_LONG: tuple[str, ...] = ()
@@ -36,7 +32,6 @@ LONG_FUNCTIONS: dict[str, str] = {
     "missions.cli.plan": "what is asked, planned, written and said, in that order",
     "missions.make.spots_cli.spots": "half of it is the answer, an entry a line",
     "missions.planner._planned": "each step of a plan takes what the one before it has found",
-    "analysis.calibrate_valves.measuring": "a session around the piece that it repeats",
     "missions.refills._Run.__init__": "one table of a run's places, column after column",
 }
 
@@ -170,7 +165,8 @@ def findings(root: Path = ROOT) -> list[str]:
     size = {
         name: len(path.read_text(encoding="utf-8").splitlines()) for name, path in files.items()
     }
-    found = []
+    found: list[str] = []
+    alone: dict[str, str] = {}
     for name, path in files.items():
         if size[name] > LINES_MAX and name not in TOO_LONG:
             found.append(f"{name}: {size[name]} lines, more than {LINES_MAX}")
@@ -179,13 +175,16 @@ def findings(root: Path = ROOT) -> list[str]:
         is_exported = any(files[user].name in ("__init__.py", "__main__.py") for user in users)
         is_door = name in doors or name in asked_for or path.name in ("__init__.py", "__main__.py")
         is_study = name.startswith("sitl.studies.")  # run by themselves: python -m ...
-        if len(users) > 1 or is_study or is_exported or is_door or name in EXCEPTIONS:
+        if len(users) > 1 or is_study or is_exported or is_door:
             continue
         if not users:
-            found.append(f"{name}: nobody imports it")
+            alone[name] = f"{name}: nobody imports it"
         elif size[name] + size[next(iter(users))] <= LINES_MAX:
-            found.append(f"{name}: only {next(iter(users))} imports it: fold it into that")
-    found += [f"{name}: no module, and an exception" for name in EXCEPTIONS if name not in files]
+            alone[name] = f"{name}: only {next(iter(users))} imports it: fold it into that"
+    found += [line for name, line in alone.items() if name not in EXCEPTIONS]
+    found += [
+        f"{name}: an exception that nothing needs" for name in EXCEPTIONS if name not in alone
+    ]
     return found + private_imports(files) + long_functions(files)
 
 

@@ -23,10 +23,11 @@ from typing import Annotated, Any
 
 import typer
 
-from companion.cli.answer import AsJson, answer, note
+from companion.cli.answer import AsJson, answer
 from companion.errors import ConfigError, VrsprayError
 from companion.wording import install_command
 from sitl.campaign.dataset import read_columns, read_manifest
+from sitl.studies import run_study
 
 # Figures by their columns in a campaign's dataset.
 COLUMNS = {
@@ -181,15 +182,7 @@ def sensitivity(
 
 def main() -> int:
     """Run it; what a user did wrong is one line."""
-    try:
-        app()
-    except ConfigError as error:
-        note(f"error: {error}")
-        return 2
-    except VrsprayError as error:
-        note(f"error: {error}")
-        return 1
-    return 0
+    return run_study(app)
 
 
 # How the costs of errors are shown: lines for a terminal, a page, a picture.

@@ -16,9 +16,10 @@ from typing import Annotated
 
 import typer
 
-from companion.cli.answer import AsJson, answer, note
+from companion.cli.answer import AsJson, answer
 from companion.errors import ConfigError, VrsprayError
 from companion.wording import install_command
+from sitl.studies import run_study
 from sitl.studies.validation_flights import COMMAND, Validation, summary_lines, validate, write_page
 
 IMAGES = "images"
@@ -49,15 +50,7 @@ def validation(
 
 def main() -> int:
     """Run it; what a user did wrong is one line."""
-    try:
-        app()
-    except ConfigError as error:
-        note(f"error: {error}")
-        return 2
-    except VrsprayError as error:
-        note(f"error: {error}")
-        return 1
-    return 0
+    return run_study(app)
 
 
 def check_folder(folder: Path) -> None:
