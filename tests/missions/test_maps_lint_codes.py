@@ -64,3 +64,39 @@ def test_nothing_is_explained_that_no_longer_exists() -> None:
     text = "".join(path.read_text(encoding="utf-8") for path in SOURCES)
     assert [code for code in documented() if f'"{code}' not in text] == []
     assert all(entry["meaning"] and entry["severity"] for entry in documented().values())
+
+
+ANYTHING = "\0"
+
+
+def texts_in(source: str) -> set[str]:
+    """Return every text of a source; what is worked out in it is one sign."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.JoinedStr):
+            parts = [
+                one.value if isinstance(one, ast.Constant) else ANYTHING for one in node.values
+            ]
+            found.add(re.sub(f"{ANYTHING}+", ANYTHING, "".join(map(str, parts))))
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            found.add(node.value)
+    return found
+
+
+def unsaid(example: str, texts: set[str]) -> list[str]:
+    """Return what of an example no text says."""
+    said = [re.sub(r"\{.*?\}", ANYTHING, one) for one in re.findall(r'"(.+?)"(?:, |$)', example)]
+    return [one for one in said or [example] if not any(one in text for text in texts)]
+
+
+def test_an_example_is_what_the_program_says_to_the_letter() -> None:
+    texts = texts_in('f(f"no {kind}{more} in {path}; " "take another", code="a-b")')
+    assert unsaid('"no {map} in {a.zip}; take another"', texts) == []
+    assert unsaid('"no map in {a.zip}"', texts) == ["no map in \0"]
+    every = set().union(*(texts_in(path.read_text(encoding="utf-8")) for path in SOURCES))
+    found = {
+        code: left
+        for code, entry in documented().items()
+        if (left := unsaid(entry["example"], every))
+    }
+    assert found == {}

@@ -21,6 +21,11 @@ def problems() -> list[dict[str, Any]]:
     return found
 
 
+def shown(example: str) -> str:
+    """Return an example as a person reads it, without the braces around its values."""
+    return example.replace("{", "").replace("}", "")
+
+
 def page() -> str:
     """Return the page: a table a section."""
     parts, section = [INTRODUCTION], None
@@ -31,6 +36,6 @@ def page() -> str:
                 f"\n## {section}\n\n| Code | | Meaning | Example | Fix |\n|---|---|---|---|---|"
             )
         codes = ", ".join(f"`{code}`" for code in one["codes"])
-        cells = (codes, one["severity"], one["meaning"], one["example"], one["fix"])
+        cells = (codes, one["severity"], one["meaning"], shown(one["example"]), one["fix"])
         parts.append(f"| {' | '.join(cells)} |")
     return "\n".join(parts)
