@@ -75,9 +75,9 @@ def lag(
     is_write: Write = False,
     as_json: AsJson = False,
 ) -> None:
-    """Measure the lags by kind, from the flow meter of a flight.
+    """Measure the lags from the flow meter of a flight.
 
-    Of on, off, up and down, by what was ordered when.
+    One lag each for switching on and off, and for raising and lowering the flow.
 
     Exit 0: all lags; 1: too few good steps of a kind; 2: the file or an option cannot be used.
     """

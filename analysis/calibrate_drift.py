@@ -75,7 +75,7 @@ def drift(
     ] = 0.001,
     as_json: AsJson = False,
 ) -> None:
-    """Name valves that have drifted: nozzles that block or wear.
+    """Find valves whose flow has drifted: blocked or worn nozzles.
 
     From the total flow meter, wherever the valves sprayed differently. Exit 0: none is further
     than 5 % off; 1: one is, or the flights do not tell; 2: a journal cannot be used.

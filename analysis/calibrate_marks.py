@@ -56,7 +56,7 @@ def lag_marks(
     is_write: Write = False,
     as_json: AsJson = False,
 ) -> None:
-    """Measure the position's lag and offsets by marks on the ground.
+    """Measure the position's lag and offsets from ground marks.
 
     They are lag.position_s, boom.forward_m and the offset of the map.
 

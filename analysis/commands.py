@@ -30,7 +30,7 @@ WSP = Command(
 )
 TRIAL = Command(
     target="analysis.trial_cli:trial",
-    help="Evaluate a field trial: what plots got, yields by treatment.",
+    help="Evaluate a field trial: the plots, and yields by treatment.",
     haste="patient",
 )
 FLIGHTS_SHOW = Command(
@@ -39,7 +39,7 @@ FLIGHTS_SHOW = Command(
 )
 FLIGHTS_REMAINING = Command(
     target="analysis.journals.cli:REMAINING",
-    help="Tell what is treated, what is left in hectares and litres, and where to go on.",
+    help="Show what is treated, what is left in hectares and litres, and where to resume.",
 )
 FLIGHTS_RECOVER = Command(
     target="analysis.journals.cli:RECOVER",

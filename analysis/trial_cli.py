@@ -57,16 +57,19 @@ def evaluate_trial(
         typer.Option(metavar="FILE", help="Harvest points: .csv with lat and lon, or .shp."),
     ] = None,
     value: Annotated[
-        str | None, typer.Option(metavar="COLUMN", help="Of the harvest's points.")
+        str | None,
+        typer.Option(metavar="COLUMN", help="Column of the harvest points with the yield."),
     ] = None,
     tolerance_percent: Annotated[
         float,
-        typer.Option(metavar="PCT", help="A plot fails farther from its rate.", min=0.1, max=100.0),
+        typer.Option(
+            metavar="PCT", help="A plot whose rate is further off fails.", min=0.1, max=100.0
+        ),
     ] = 10.0,
     covered_percent: Annotated[
         float,
         typer.Option(
-            metavar="PCT", help="A plot fails with less of it sprayed.", min=1.0, max=100.0
+            metavar="PCT", help="A plot with less of it sprayed fails.", min=1.0, max=100.0
         ),
     ] = 90.0,
     position_m: Annotated[
@@ -77,7 +80,7 @@ def evaluate_trial(
     ] = 0.02,
     meter_percent: Annotated[
         float,
-        typer.Option(metavar="PCT", help="Of flow meter or curve, 1 sd.", min=0.0, max=50.0),
+        typer.Option(metavar="PCT", help="Error of flow meter or curve, 1 sd.", min=0.0, max=50.0),
     ] = 3.0,
     keep_failed: Annotated[
         bool, typer.Option("--keep-failed", help="Compare yields of plots that failed, too.")
@@ -87,7 +90,7 @@ def evaluate_trial(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Evaluate a trial: the rate each plot got, which failed, and yields by treatment.
+    """Evaluate a trial: the rate each plot got, which plots failed, and yields by treatment.
 
     Exit 0: evaluated; 1: plots failed, or yields cannot be compared; 2: a file cannot be used.
     """
@@ -96,7 +99,7 @@ def evaluate_trial(
     if (harvest is None) != (value is None):
         raise typer.BadParameter("--harvest and --value go together")
     if harvest is not None and importlib.util.find_spec("statsmodels") is None:
-        raise TrialError(f"comparing yields takes statsmodels; {install_command('office')}")
+        raise TrialError(f"comparing yields needs statsmodels; {install_command('office')}")
     trial, features = read_trial(plots_file)
     strips, frame = _flown(journals)
     plots = local_plots(features, frame)
@@ -266,7 +269,9 @@ def read_harvest(path: Path, value: str) -> tuple[Floats, Floats, Floats]:
     table = np.array(rows, dtype=np.float64).reshape(-1, 3)
     table = table[np.isfinite(table).all(axis=1)]
     if not (len(table) and (np.abs(table[:, 0]) <= 90.0).all()):
-        raise TrialError(f"{path}: no points with {value} and coordinates in degrees; export anew")
+        raise TrialError(
+            f"{path}: no points with {value} and coordinates in degrees; export it again"
+        )
     return table[:, 0], table[:, 1], table[:, 2]
 
 

@@ -217,7 +217,7 @@ def _lines(config: Config, flight_map: FlightMap) -> Lines | None:
         )
     except ValueError as error:
         raise ConfigError(
-            f"{config.path}: mission.lines = {show_value(mission.lines)}: {error}; plan anew"
+            f"{config.path}: mission.lines = {show_value(mission.lines)}: {error}; plan again"
         ) from error
 
 
@@ -361,7 +361,7 @@ def beyond_label(config: Config) -> list[Problem]:
         found.append(Problem(
             severity="warning",
             code="label-rates-differ",
-            text=f"product.rate_max_l_ha = {own:g}, and {file} says {other:g}; the lower one holds",
+            text=f"product.rate_max_l_ha = {own:g}, and {file} says {other:g}; the lower applies",
             where="product.rate_max_l_ha",
             fix="look at the label, and write its rate in one of the two",
         ))  # fmt: skip

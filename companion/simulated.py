@@ -55,7 +55,7 @@ class Simulated:
         return {"yes": "SIMULATED", "no": "", "unknown": "not known whether simulated"}[self.word]
 
 
-NOT_ASKED = Simulated(word="unknown", because="no autopilot has told")
+NOT_ASKED = Simulated(word="unknown", because="no autopilot has said so")
 UNMARKED = Simulated(
     word="unknown", because="the journal is older than this mark", is_unmarked=True
 )

@@ -225,9 +225,9 @@ def over_warnings(lines: Floats, ground: BaseGeometry, boom: Boom) -> tuple[str,
         return ()
     off_m2 = float(whole(strips).difference(ground).area)
     return (
-        f"{counted(count, 'line')} with an end of the boom beyond the border: to be flown "
-        f'with the companion and border = "inside" alone; whole booms would spray {off_m2:.0f} m2 '
-        "off the field",
+        f"{counted(count, 'line')} with an end of the boom beyond the border: fly them only "
+        f'with the companion and border = "inside"; whole booms would spray {off_m2:.0f} m2 '
+        "outside the field",
     )
 
 

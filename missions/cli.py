@@ -96,7 +96,8 @@ def plan(
         list[Path] | None, typer.Option(metavar="FILE", help="Ground not to spray; repeatable.")
     ] = None,
     no_spray_buffer_m: Annotated[
-        float, typer.Option(metavar="M", help="Distance to keep from it.", min=0.0, max=1000.0)
+        float,
+        typer.Option(metavar="M", help="Distance to keep from that ground.", min=0.0, max=1000.0),
     ] = 0.0,
     depot: Annotated[
         list[str] | None, typer.Option(metavar="LAT,LON", help="Refill place; repeatable.")
@@ -201,7 +202,7 @@ def plan(
     ] = None,
     in_tank_l: Annotated[
         float,
-        typer.Option(metavar="L", help="Mix in the tank now: it is not mixed again.", min=0.0),
+        typer.Option(metavar="L", help="Mix already in the tank before the first sortie.", min=0.0),
     ] = 0.0,
     force: Annotated[
         bool, typer.Option("--force", help="Replace a plan of this name, with all its sorties.")
@@ -325,7 +326,7 @@ def plan(
     told = {
         "assumed, not given: ": ", ".join(result["assumed"].values()),
         "rates of ": "" if prescription is not None else own,
-        "removed, of the plan that was there: ": names_of(removed) if removed else "",
+        "removed from the earlier plan: ": names_of(removed) if removed else "",
         "note: ": _FLOWN_ONCE if once else "",
         **{f"warning: {warning}": " " for warning in warnings},
         "stopped after ": f"{took_s:.0f} s; wrote the best plan so far" if watch.stopped else "",

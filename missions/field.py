@@ -216,7 +216,7 @@ def local_area(area: Area, frame: LocalFrame) -> Area:
     local = project(area, frame)
     valid = local if local.is_valid else make_valid(local)
     if valid is None:
-        raise PlanError("an area of the field has no ground; draw it again")
+        raise PlanError("a part of the field has no area; draw it again")
     return valid
 
 
@@ -346,9 +346,9 @@ class WindBuffer:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.speed_m_s <= 100.0:
-            raise ValueError(f"a wind of {self.speed_m_s} m/s does not exist")
+            raise ValueError(f"a wind of {self.speed_m_s} m/s is not possible")
         if not -360.0 <= self.from_deg <= 360.0:
-            raise ValueError(f"{self.from_deg} is not a direction of the wind")
+            raise ValueError(f"{self.from_deg} is not a wind direction")
         if not 0.0 <= self.m_per_m_s <= 1000.0:
             raise ValueError(f"{self.m_per_m_s} m for each m/s of wind is not a buffer")
 

@@ -79,7 +79,7 @@ def flown_rates(plan: Plan, rates: Rates) -> FlownRates:
     sprayed = rate > 0.0
     rate, weight = rate[sprayed], weight[sprayed]
     if not len(rate):
-        raise PlanError("mix: the passes spray nothing, so that there is nothing to mix")
+        raise PlanError("mix: the passes spray nothing, so there is nothing to mix")
     return FlownRates(
         mean_l_ha=float(np.average(rate, weights=weight)),
         low_l_ha=float(rate.min()),

@@ -141,7 +141,7 @@ def _hgt(path: Path) -> Dem:
     posts = HGT_POSTS.get(len(content))
     if posts is None:
         raise PlanError(
-            f"{path}: {len(content)} bytes are no tile of 1201 or 3601 posts; copy it again"
+            f"{path}: {len(content)} bytes are not a tile of 1201 or 3601 posts; copy it again"
         )
     raw = np.frombuffer(content, dtype=">i2").reshape(posts, posts)
     heights = np.where(raw == NO_HEIGHT, np.nan, raw.astype(np.float64))

@@ -271,6 +271,9 @@ def far_warnings(
             + ("its sortie" if len(own) == 1 else f"each of its {len(own)} sorties")
         )
         if not has_battery:
-            text += "; give mission.battery_wh and power_hover_w, or nobody looks whether it lasts"
+            text += (
+                "; give mission.battery_wh and power_hover_w: without them nothing checks that the "
+                "battery lasts"
+            )
         said.append(text)
     return tuple(said)

@@ -201,7 +201,7 @@ def fly(
     ] = None,
     controller: Annotated[
         str | None,
-        typer.Option(metavar="MODULE:CLASS", help="A method of your own in place of vrspray's."),
+        typer.Option(metavar="MODULE:CLASS", help="Your own controller, in place of vrspray's."),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for truth, result, picture and journal.")

@@ -9,7 +9,7 @@ DEMO = Command(
 )
 CAMPAIGN = Command(
     target="sitl.campaign.cli:app",
-    help="Fly many simulated flights over settings; show what they say.",
+    help="Simulate many flights, varying settings; show the results.",
     haste="patient",
     hastes={"show": "quick"},
 )

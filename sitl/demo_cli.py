@@ -60,12 +60,12 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 @app.command(epilog="Example: vrspray demo --out demo-out --speed 5 --seed 2")
 def demo_flights(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for what is made.")] = Path(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")] = Path(
         "demo-out"
     ),
     speed: Annotated[
         list[float] | None,
-        typer.Option(metavar="V", help="Speed [m/s], 1 to 15; may be repeated. Default: 4, 5, 6."),
+        typer.Option(metavar="V", help="Speed [m/s], 1 to 15; repeatable. Default: 4, 5, 6."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 1,
     fidelity: Annotated[Fidelity, typer.Option(help="Pulses, or their mean.")] = Fidelity.PULSED,
@@ -78,7 +78,7 @@ def demo_flights(
     ] = None,
     controller: Annotated[
         str | None,
-        typer.Option(metavar="MODULE:CLASS", help="A method of your own beside the others."),
+        typer.Option(metavar="MODULE:CLASS", help="Your own controller, beside the others."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

@@ -29,7 +29,7 @@ ABOUT = {
     "atomiser": "two rotary atomisers fed by one pump",
     "own-method": "controllers of one's own, for --controller",
     "zones": "a made-up field's data by a script, for vrspray make zones",
-    "campaigns": "many flights over settings, for vrspray campaign",
+    "campaigns": "many flights with varied settings, for vrspray campaign",
     "profiles": "wirings of valves on this computer's own lines",
     DEPLOY: "for the vehicle: install script, ArduPilot's watchdog script, systemd unit",
 }
@@ -88,13 +88,13 @@ def copy(
         ),
     ] = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Write over the files of an earlier copy.")
+        bool, typer.Option("--force", help="Replace the files of an earlier copy.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Copy an example, with the examples that it needs.
 
-    Without --to the commands of the documentation work as they stand there. Exit 2: no such
+    Without --to, the commands in the documentation work unchanged. Exit 2: no such
     example, or the folder is there already.
     """
     found = all_examples()

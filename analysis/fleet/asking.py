@@ -61,10 +61,12 @@ class Fleet:
         try:
             statements = self._connection.extract_statements(sql)
             if len(statements) != 1 or statements[0].type.name not in _READING:
-                raise ConfigError("SQL: give one question, such as SELECT count(*) FROM flights")
+                raise ConfigError("SQL: give one query, such as SELECT count(*) FROM flights")
             return _plain(self._connection.sql(sql).to_arrow_table())
         except duckdb.OutOfMemoryException as error:
-            raise ConfigError("SQL: it takes too much memory; give more by --memory-mb") from error
+            raise ConfigError(
+                "SQL: the query needs too much memory; allow more with --memory-mb"
+            ) from error
         except duckdb.Error as error:
             raise ConfigError(f"SQL: {_line(error)}") from error
 

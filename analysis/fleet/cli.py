@@ -19,7 +19,7 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
     no_args_is_help=True,
-    help="Many journals as one data set: add them, ask by SQL, report, serve.",
+    help="Many journals as one data set: add, query with SQL, report, serve.",
     epilog="Example: vrspray fleet add flights --into fleet",
 )
 
@@ -42,18 +42,18 @@ def add(
             "--into",
             "--fleet",
             metavar="FOLDER|URL",
-            help="A folder, or an fsspec URL; made if it is not there.",
+            help="A folder, or an fsspec URL; made if missing.",
         ),
     ],
     machine: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME", help="Who flew these, where a journal names no application.aircraft."
+            metavar="NAME", help="Machine that flew, if a journal names no application.aircraft."
         ),
     ] = None,
     is_quick: Annotated[
         bool,
-        typer.Option("--quick", help="Do not evaluate the flights now; a later add does."),
+        typer.Option("--quick", help="Leave the evaluation to a later add."),
     ] = False,
     processes: Annotated[
         int | None,
@@ -61,9 +61,9 @@ def add(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Take journals into a fleet's data set.
+    """Add journals to a fleet's data set.
 
-    Adding a journal twice changes nothing; one that went on takes the place of its earlier copy.
+    Adding a journal twice changes nothing; a longer copy replaces a shorter one.
     Exit 0: all are in; 1: some could not be read, and are listed; 2: wrong input.
     """
     from analysis.fleet.adding import add as add_all
@@ -136,16 +136,14 @@ def query(
     fleet: Place,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="All rows as .csv, .parquet or .json, in place of a table."
-        ),
+        typer.Option(metavar="FILE", help="Write all rows to .csv, .parquet or .json instead."),
     ] = None,
     memory_mb: Annotated[
-        int, typer.Option(min=50, max=1_000_000, help="What the question may take, in MB.")
+        int, typer.Option(min=50, max=1_000_000, help="Memory that the query may use, in MB.")
     ] = 300,
     as_json: AsJson = False,
 ) -> None:
-    """Ask the flights by SQL (DuckDB).
+    """Query the flights with SQL (DuckDB).
 
     Tables: flights, closings, faults, valves, damaged.
     """
@@ -181,7 +179,7 @@ def forget(
 ) -> None:
     """Remove an operator from every file.
 
-    It stays so when the journals come again.
+    They stay removed when their journals are added again.
     """
     from analysis.fleet.flight_row import operator_number
     from analysis.fleet.store import STORE_ERRORS, Store
@@ -222,7 +220,7 @@ def report(
     kind: Kinds = None,
     as_json: AsJson = False,
 ) -> None:
-    """Sum the fleet up, as page, JSON, CSV or Parquet.
+    """Summarise the fleet as a web page, JSON, CSV and Parquet.
 
     By machine, field, product, operator and month.
     """
@@ -265,7 +263,7 @@ def serve(
     ] = None,
     tokens: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Where the page's tokens are kept; made if not there."),
+        typer.Option(metavar="FILE", help="File of the page's tokens; made if missing."),
     ] = None,
     certificate: Annotated[
         Path | None, typer.Option("--tls-certificate", metavar="PEM", help="With --tls-key: HTTPS.")
@@ -277,7 +275,7 @@ def serve(
 ) -> None:
     """Show the fleet's report on a page, read only, until Ctrl-C.
 
-    Who looks from another computer needs the link with its token that is printed here.
+    From another computer, open the link that is printed here, with its token.
     """
     from analysis.fleet.serving import build_app
     from analysis.fleet.serving import serve as serve_page

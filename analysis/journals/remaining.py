@@ -34,19 +34,24 @@ PLACE_MIN_M = 0.5
 
 def remaining(
     journals: Annotated[
-        list[Path], typer.Argument(metavar="JOURNAL...", help="All flights of the job, .gpkg.")
+        list[Path],
+        typer.Argument(metavar="JOURNAL...", help="Journals (.gpkg) of all flights of the job."),
     ],
     map_file: Annotated[
         Path | None,
-        typer.Option("--map", metavar="FILE", help="Prescription; else that of the last flight."),
+        typer.Option(
+            "--map", metavar="FILE", help="Prescription map; default: that of the last flight."
+        ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="FILE.geojson", help="The rest and the resume point."),
+        typer.Option(
+            "--out", metavar="FILE.geojson", help="Write the untreated ground and the resume point."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Tell what is treated, what is left in hectares and litres, and where to go on.
+    """Show what is treated, what is left in hectares and litres, and where to resume.
 
     What is left in pieces narrower than half a valve's strip does not count: no valve is for that.
 

@@ -30,8 +30,7 @@ def report_flight(
     profile: Annotated[
         list[Law] | None,
         typer.Option(
-            help="Legal record: eu, us, australia, generic; may be repeated. "
-            "Default: the journal's."
+            help="Legal record: eu, us, australia, generic; repeatable. Default: the journal's."
         ),
     ] = None,
     time_zone: Annotated[

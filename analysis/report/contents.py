@@ -330,7 +330,7 @@ def warnings_of(
         *_simulated(flight),
         *_training(flight),
         *_journal(flight, clock),
-        *(_warning("unread", f"Of the journal could not be read: {each}.") for each in unread),
+        *(_warning("unread", f"Parts could not be read: {each}.") for each in unread),
         *_inhibited(flight, assessment, treated),
         *held_ground(assessment),
         *_wishes(flight, clock),

@@ -146,7 +146,7 @@ def _read(file: Path) -> dict[str, Any]:
         reason = (error.strerror or "cannot be read").lower()
         raise ConfigError(f"{file}: {reason}; give a .toml file with [application]") from error
     except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{file}: is no TOML file: {' '.join(str(error).split())}") from error
+        raise ConfigError(f"{file}: is not a TOML file: {' '.join(str(error).split())}") from error
     found = _flat(document)
     if not found:
         raise ConfigError(f"{file}: has neither [application] nor [product]")

@@ -341,7 +341,7 @@ def sheets_of(path: Path) -> Iterator[Sheet]:
                 yield from _pages(path, image)
     except UnidentifiedImageError as error:
         raise ImageError(
-            f"{path}: is no image that can be read; give PNG, TIFF, JPEG, BMP or WebP"
+            f"{path}: is not an image that can be read; give PNG, TIFF, JPEG, BMP or WebP"
         ) from error
     except Image.DecompressionBombError as error:
         raise _too_large(path, "more than 178 million") from error

@@ -54,7 +54,7 @@ COMMANDS = {
     ),
     "top": Command(
         target="companion.cli.top:app",
-        help="Show what a running companion does, live, by its MAVLink.",
+        help="Show the live state of a running companion, from its MAVLink.",
     ),
     "ground": Command(
         target="companion.cli.ground:app",

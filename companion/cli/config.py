@@ -105,19 +105,19 @@ def new(
         str,
         typer.Option(
             metavar="FLOW",
-            help="Of one valve: L/min, '03 at 3 bar' (ISO size), or a bucket test's CSV file.",
+            help="Flow of one valve: L/min, '03 at 3 bar' (ISO size), or a bucket test's CSV file.",
         ),
     ] = "0.8",
     map_file: Annotated[
         str, typer.Option("--map", metavar="FILE", help="Prescription map; default: none.")
     ] = "",
     unit: Annotated[
-        str, typer.Option(metavar="UNIT", help="Of the map, where it does not say it: L/ha, ...")
+        str, typer.Option(metavar="UNIT", help="Unit of the map, where it does not say: L/ha, ...")
     ] = "",
     swath_m: Annotated[
         float | None, typer.Option(metavar="M", help="Swath; default: valves times spacing.")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Write a first configuration: six questions, or --yes.

@@ -38,7 +38,7 @@ from companion.ground.work import (
 from companion.ports import Sensor
 from companion.sensors import FlowMeter
 
-_BROKEN = "not measured: it was broken off"
+_BROKEN = "not measured: stopped early"
 _LEFT_OUT = "left out by the operator"
 
 
@@ -456,7 +456,7 @@ def dry_check(valve: str, answer: str, *, channel: int | None) -> Check:
     if answer == YES:
         return ok(name, "clicked")
     if answer == NO:
-        fix = f"see the plug of its coil, its driver, and that it hangs on {where} (valve.channel)"
+        fix = f"check its coil's plug, its driver, and that it is wired to {where} (valve.channel)"
         return fail(name, "did not click", fix)
     fix = f"swap the wires, or correct valve.channel: {where} moves valve {answer}"
     return fail(name, f"valve {answer} clicked in its place", fix)
@@ -477,13 +477,13 @@ def wet_checks(judged: ClickJudgement, names: Sequence[str]) -> Iterator[Check]:
 def _wet(found: ClickFinding, valve: str) -> Check:
     name, kind = name_of(valve), found.kind
     if kind is FaultKind.METER_FAULT or found.share is None:
-        fix = "see the meter's wiring and supply, then ask again"
-        return fail(name, "the flow meter gave no sound count", fix)
+        fix = "check the meter's wiring and supply, then run it again"
+        return fail(name, "the flow meter gave no reliable count", fix)
     share = f"{100.0 * found.share:.0f} % of the others' flow"
     if kind is None:
         return ok(name, f"{share} ({100.0 * found.limit:.0f} % off would be seen)")
     if kind is FaultKind.STUCK_OPEN:
-        fix = "close the tap, then free or change the valve"
+        fix = "close the tap, then free or replace the valve"
         return fail(name, "delivers all the time: stuck open", fix)
     if kind is FaultKind.STUCK_CLOSED:
         fix = (
@@ -493,26 +493,30 @@ def _wet(found: ClickFinding, valve: str) -> Check:
     judge = warn if abs(found.share - 1.0) <= FAR_SHARE else fail
     if kind is FaultKind.CLOG:
         return judge(name, f"{share}: clogged", "clean its nozzles and strainers")
-    return judge(name, f"{share}: worn, or a leak behind it", "change its nozzles, see its hose")
+    return judge(name, f"{share}: worn, or a leak behind it", "replace its nozzles, check its hose")
 
 
 def _common(judged: ClickJudgement) -> Check:
     name, fault = "click-flow", judged.fault
     if fault is FaultKind.METER_FAULT or judged.common is None:
-        fix = "see the meter's wiring and supply, then ask again"
-        return fail(name, "the flow meter gave no sound count", fix)
+        fix = "check the meter's wiring and supply, then run it again"
+        return fail(name, "the flow meter gave no reliable count", fix)
     share = f"valves deliver {100.0 * judged.common:.0f} % of what the table says"
     idle = f"{0.06 * judged.idle_ml_s:.2f} L/min with all closed"
     if fault is FaultKind.NO_FLOW:
         fix = "switch the pump on, open the tap, prime the lines (vrspray ground prime)"
         return fail(name, "no valve delivers anything", fix)
     if fault is FaultKind.SUPPLY:
-        fix = "see pump, regulator and filter, or calibrate again (vrspray calibrate flow)"
+        fix = "check pump, regulator and filter, or calibrate again (vrspray calibrate flow)"
         return warn(name, share, fix)
     if fault is FaultKind.STUCK_OPEN:
         return fail(
-            name, f"{idle}: a valve stays open", "see which nozzle drips, change that valve"
+            name,
+            f"{idle}: a valve stays open",
+            "find the nozzle that drips, and replace that valve",
         )
     if fault is FaultKind.LEAK:
-        return fail(name, f"{idle}: a leak", "find it before the valves, or see which nozzle drips")
+        return fail(
+            name, f"{idle}: a leak", "find it before the valves, or look for the nozzle that drips"
+        )
     return ok(name, f"{share}, {idle}")

@@ -123,8 +123,10 @@ CLOSED_MAX_S = 0.35
 # The script's 0.3 s, one run of it, and what a message takes.
 SCRIPT_MAX_S = 0.35
 _UNITS_S = {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
-_BUSY = "see what else this computer does: vrspray doctor (real-time, cpu-governor, throttling)"
-_SCRIPT = "install the script anew, and set SPRW_TIMEOUT_MS to 300: deploy/ardupilot/README.md"
+_BUSY = (
+    "check what else this computer is doing: vrspray doctor (real-time, cpu-governor, throttling)"
+)
+_SCRIPT = "reinstall the script, and set SPRW_TIMEOUT_MS to 300: deploy/ardupilot/README.md"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -233,7 +235,7 @@ def _fed(found: Systemd) -> Check:
     stamp = unit.get("WatchdogTimestampMonotonic", "")
     age_s = found.now_s - int(stamp) / 1e6 if stamp.isdecimal() and int(stamp) else None
     if age_s is None or not 0.0 <= age_s <= limit_s:
-        return fail(name, "the control loop feeds it no more", "see journalctl -u vrspray")
+        return fail(name, "the control loop no longer feeds it", "see journalctl -u vrspray")
     return ok(name, f"fed {age_s:.1f} s ago, WatchdogSec is {limit_s:g}")
 
 
@@ -281,7 +283,7 @@ def questions(
             text="Let a valve run (vrspray ground prime --valve NAME) and pull the cable between "
             "flight controller and driver board's orders, or kill -STOP the companion: did it "
             "close within half a second",
-            fix="do not fly: see output.dither_us and docs/howto/build-a-driver-board.md",
+            fix="do not fly: check output.dither_us and docs/howto/build-a-driver-board.md",
             applies=is_servo and has_dither,
             otherwise="output.dither_us is 0, or no servo outputs are used",
         ),
@@ -289,7 +291,7 @@ def questions(
             name="dead-man",
             text="Let a valve run and pull the wire of ALIVE: did pump and master valve drop "
             "within half a second",
-            fix="do not fly: see the monostable and its relay (docs/howto/wire-gpio.md)",
+            fix="do not fly: check the monostable and its relay (docs/howto/wire-gpio.md)",
             applies=has_alive,
             otherwise="gpio.alive_line is not set",
         ),
@@ -303,7 +305,7 @@ def questions(
         Question(
             name="estop-works",
             text="Press the emergency stop with the pump on: did the pump stop at once",
-            fix="do not fly: see its wiring (docs/safety.md)",
+            fix="do not fly: check its wiring (docs/safety.md)",
             applies=has_estop,
             otherwise="safety.estop_line is not set",
         ),
@@ -461,13 +463,13 @@ class _Trial:
         closed = [since_s for since_s, pulse_us in after if self._is_closed(pulse_us)]
         moved = [since_s for since_s, pulse_us in after if not self._is_closed(pulse_us)]
         if not after:
-            return ScriptTrial(problem="SERVO_OUTPUT_RAW came no more")
+            return ScriptTrial(problem="SERVO_OUTPUT_RAW stopped arriving")
         closed_s = min(closed) if closed and not max(closed) < max(moved, default=0.0) else None
         return ScriptTrial(open_s=max(moved, default=0.0), closed_s=closed_s)
 
     def _unmoved(self) -> str:
         if not self._listener.reports:
-            return "nothing tells what the output does (SERVO_OUTPUT_RAW)"
+            return "nothing reports what the output does (SERVO_OUTPUT_RAW)"
         return (
             f"output {self._options.outputs[0]} reads {self._listener.reports[-1][1]} us, "
             f"ordered {self._moved_us}"

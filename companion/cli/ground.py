@@ -359,7 +359,7 @@ def _lines(piece: Piece, result: dict[str, Any]) -> list[str]:
             result["csv"],
         ]
     elif piece.task.is_whole:
-        lines.append("a catch that was broken off is worth nothing: empty the cups, do it again")
+        lines.append("a catch that stopped early is useless: empty the cups and repeat it")
     return lines
 
 
@@ -413,7 +413,7 @@ _WORDS: dict[str, str] = {
     GroundReason.ESTOP_UNKNOWN: "the emergency stop is pressed or cannot be read",
     GroundReason.NOT_HELD: "the key was released",
     GroundReason.STALLED: "this computer paused for a moment",
-    GroundReason.TIME_OVER: "the time limit is over; start again",
+    GroundReason.TIME_OVER: "the time limit was reached; start again",
     GroundReason.DONE: "done",
     KEY: "another key was pressed",
     ENDED: "stdin ended",
@@ -441,7 +441,7 @@ app = typer.Typer(
 )
 Valves = Annotated[
     list[str] | None,
-    typer.Option("--valve", metavar="NAME", help="Only this valve; may be repeated."),
+    typer.Option("--valve", metavar="NAME", help="Only this valve; repeatable."),
 ]
 Seconds = Annotated[
     float | None, typer.Option(min=0.2, max=30.0, help="Total time; at most 30 s in one go.")
@@ -516,7 +516,7 @@ def catch(
 ) -> None:
     """Catch test: open valves for an exact time.
 
-    All at one duty; the volume to be expected is printed.
+    All at one duty cycle; prints the volume to expect.
     """
     wish = Wish(kind=GroundKind.CATCH, valves=tuple(valves or ()), duty=duty, seconds=seconds)
     do(asked, wish, is_water=is_water)

@@ -128,7 +128,7 @@ def answers_of(
 def known_unit(unit: str) -> str:
     """Return a unit of rates as it is, or none; a ConfigError for another."""
     if unit and unit not in UNITS:
-        raise ConfigError(f"{unit!r}: no unit of rates; write one of {', '.join(UNITS)}")
+        raise ConfigError(f"{unit!r}: not a unit of rates; write one of {', '.join(UNITS)}")
     return unit
 
 
@@ -164,8 +164,8 @@ def _with_autopilot(answers: Answers, text: str) -> Answers:
     name, *rest = words or [""]
     if name not in AUTOPILOTS or len(rest) > 1:
         raise ConfigError(
-            f"{' '.join(words)!r}: no autopilot; write ardupilot or px4, and then its link, such "
-            "as serial:/dev/serial0:921600"
+            f"{' '.join(words)!r}: not an autopilot; write ardupilot or px4, and then its link, "
+            "such as serial:/dev/serial0:921600"
         )
     link = rest[0] if rest else answers.link
     is_px4 = name == "px4"  # which counts actuators from 1 where ArduPilot counts outputs
@@ -181,7 +181,7 @@ def _with_outputs(answers: Answers, text: str) -> Answers:
     words = text.split()
     kind, *rest = words or [""]
     if kind not in OUTPUTS or len(rest) > 1:
-        raise ConfigError(f"{' '.join(words)!r}: no output; write servo 9, or gpio 5")
+        raise ConfigError(f"{' '.join(words)!r}: not an output; write servo 9, or gpio 5")
     default = 5 if kind == "gpio" else 1 if answers.autopilot == "px4" else 9
     first = int(_number(rest[0], "first output", 0, 1023)) if rest else default
     return replace(answers, output="gpio" if kind == "gpio" else "servo", first_channel=first)

@@ -339,7 +339,7 @@ def label_notes(config: Config) -> list[str]:
             said = " is not declared" if each.value is None else f" = {each.value}"
             found.append(
                 f"warning: {each.key}{said}, and {config.limits_table.file} allows {each.words}; "
-                f"the valves stay closed; start with --set {each.key}=VALUE once it is so"
+                f"the valves stay closed; start with --set {each.key}=VALUE once it is within them"
             )
     return found
 

@@ -343,7 +343,7 @@ ConfigFile = Annotated[
 def show(config_file: ConfigFile, overrides: Overrides = None, as_json: AsJson = False) -> None:
     """Show the links again, the first as a QR code.
 
-    Whoever has one is let in.
+    Anyone who has one gets in.
     """
     config = load(config_file, overrides=overrides or ())
     _say(config, kept_tokens(tokens_file(config)), as_json=as_json)
@@ -351,7 +351,7 @@ def show(config_file: ConfigFile, overrides: Overrides = None, as_json: AsJson =
 
 @app.command(epilog="Example: vrspray token rotate --config config.toml")
 def rotate(config_file: ConfigFile, overrides: Overrides = None, as_json: AsJson = False) -> None:
-    """Make new tokens instead of all old ones.
+    """Replace all tokens with new ones.
 
     Old links and logins end at the next start of `run`.
     """

@@ -58,8 +58,10 @@ _PAIRS = ("rate_l_ha", "wind_m_s", "height_m", "speed_m_s", "temperature_c", "hu
 class BufferTable(Table):
     """Ground to keep away from, and how far."""
 
-    kind: Text = Field(description="of feature, as the label names it: water, garden, hives")
-    distance_m: float = Field(ge=0, le=1000, description="kept from it")
+    kind: Text = Field(
+        description="what to keep away from, as the label names it: water, garden, hives"
+    )
+    distance_m: float = Field(ge=0, le=1000, description="distance to keep from it")
     files: Texts = Field(
         min_length=1, description="maps of it: areas, lines or points; relative to this file"
     )
@@ -93,11 +95,11 @@ class LimitsFile(Table):
     humidity_min_percent: Percent | None = Field(default=None, description="of the air, relative")
     humidity_max_percent: Percent | None = Field(default=None, description="of the air, relative")
     inversion: Literal["forbidden"] | None = Field(
-        default=None, description="no spraying in one: the operator declares that there is none"
+        default=None, description="no spraying during one: the operator declares that there is none"
     )
     observed_max_h: Annotated[FiniteFloat, Field(gt=0, le=24)] = Field(
         default=2.0,
-        description="weather that the operator declares counts so long after observed_at",
+        description="how long declared weather counts after observed_at",
     )
     hours: Annotated[tuple[Hours, ...], Field(strict=False, max_length=20)] = Field(
         default=(), description='["06:00-10:00", ...] of each day'
@@ -110,7 +112,7 @@ class LimitsFile(Table):
     first_day: str | None = Field(default=None, pattern=DAY, description="of the permit")
     last_day: str | None = Field(default=None, pattern=DAY, description="of the permit")
     reentry_h: Annotated[FiniteFloat, Field(ge=0, le=8760)] | None = Field(
-        default=None, description="nobody enters for so long after spraying"
+        default=None, description="re-entry interval: nobody enters for this long after spraying"
     )
     buffer: Annotated[tuple[BufferTable, ...], Field(strict=False, max_length=50)] = Field(
         default=(), description="ground to keep away from, one table each"

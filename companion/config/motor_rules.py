@@ -102,7 +102,7 @@ def _modulating(config: Document, pump: PumpTable) -> Found:
         yield (
             "pump.us",
             f"reaches outside pump.stop_us = {pump.stop_us} to pump.max_us = {pump.max_us}; "
-            "correct the one or the other",
+            "correct one or the other",
         )
     if pump.min_us is not None and pump.us and not pump.min_us <= pump.us[-1]:
         yield "pump.min_us", f"above the curve, which ends at {pump.us[-1]}; write less"
@@ -174,7 +174,7 @@ def _atomiser(config: Document, table: AtomiserTable, key: str) -> Found:
     if not table.us[-1] - table.stop_us >= SPAN_MIN_US or not table.stop_us < table.us[0]:
         yield (
             f"{key}.us",
-            f"not all above {key}.stop_us = {table.stop_us}; correct the one or the other",
+            f"not all above {key}.stop_us = {table.stop_us}; correct one or the other",
         )
         return
     if droplet_um(config, table) is None:

@@ -54,10 +54,10 @@ class ValveTable(Table):
         default=1.0,
         description="measured: its flow over that of the mean valve, at the same duty",
     )
-    lag_on_s: OwnLag = Field(default=0.0, description="measured: later than lag.on_s by so much")
-    lag_off_s: OwnLag = Field(default=0.0, description="measured: later than lag.off_s")
-    lag_up_s: OwnLag = Field(default=0.0, description="measured: later than lag.up_s")
-    lag_down_s: OwnLag = Field(default=0.0, description="measured: later than lag.down_s")
+    lag_on_s: OwnLag = Field(default=0.0, description="measured: how much later than lag.on_s")
+    lag_off_s: OwnLag = Field(default=0.0, description="measured: how much later than lag.off_s")
+    lag_up_s: OwnLag = Field(default=0.0, description="measured: how much later than lag.up_s")
+    lag_down_s: OwnLag = Field(default=0.0, description="measured: how much later than lag.down_s")
     measured_on: Day | None = Field(
         default=None, description="day on which factor and lags were measured, YYYY-MM-DD"
     )
@@ -422,7 +422,9 @@ class TankTable(ConverterTable):
     battery: int = Field(
         default=2, ge=0, le=15, description="autopilot only: its battery monitor, counted from 0"
     )
-    reserve_l: float = Field(default=0.5, ge=0, le=1000, description="at it the valves close")
+    reserve_l: float = Field(
+        default=0.5, ge=0, le=1000, description="level at which the valves close"
+    )
     at_4_ma_l: FiniteFloat = Field(default=0.0, ge=-100, le=10_000, description="level")
     at_20_ma_l: FiniteFloat = Field(default=40.0, ge=0, le=10_000, description="level")
     tolerance_l: float = Field(

@@ -423,23 +423,23 @@ class JournalTable(Table):
         default=None,
         ge=0.1,
         le=1.0,
-        description="between two commits, what a cut of power may lose; absent: 1, "
+        description="between two commits, what a power cut may lose; absent: 1, "
         "less on fields below about 1.5 ha",
     )
     keep_free_percent: float = Field(
         default=10.0,
         ge=0,
         le=90,
-        description="old flights are removed while less of the disk is free; 0: never for that",
+        description="old flights are removed while less of the disk than this is free; 0: never",
     )
     keep_count: int | None = Field(
         default=None,
         ge=1,
         le=100_000,
-        description="so many flights are kept, never fewer than ten; absent: all",
+        description="largest number of flights to keep, ten or more; absent: all",
     )
     keep_days: float | None = Field(
-        default=None, gt=0, le=100_000, description="flights are kept so long; absent: for ever"
+        default=None, gt=0, le=100_000, description="how long flights are kept; absent: for ever"
     )
 
 
@@ -452,7 +452,7 @@ class WebTable(Table):
     )
     port: int = Field(default=8880, ge=1, le=65535, description="port to listen on")
     names: Annotated[tuple[Text, ...], Field(strict=False, max_length=20)] = Field(
-        default=(), description="other names of this computer by which browsers may call it"
+        default=(), description="other host names under which browsers may open the page"
     )
     frame_ancestors: Annotated[tuple[Text, ...], Field(strict=False, max_length=20)] = Field(
         default=(), description="origins that may show the page in a frame, such as BlueOS"
@@ -515,7 +515,7 @@ class ValveTrackingTable(Table):
 
     enabled: bool = Field(
         default=False,
-        description="true: needs a flow meter on GPIO; valves are dosed by what it tells of each",
+        description="true: needs a flow meter on GPIO; valves are dosed by what it shows of each",
     )
     limit: float = Field(
         default=0.10, ge=0.01, le=0.2, description="largest change of a valve's flow factor"
@@ -555,7 +555,7 @@ class DriftTable(Table):
         "boom.height_m",
     )
     forward_carry_m: float = Field(
-        default=0.2, ge=0, le=2, description="how far liquid flies on along the course"
+        default=0.2, ge=0, le=2, description="how far liquid travels on along the course"
     )
     limit_m: float = Field(default=2.0, ge=0, le=10, description="largest offset")
 

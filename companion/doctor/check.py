@@ -197,7 +197,7 @@ def _time_check(name: str, label: LimitsFile, config: Config, now: datetime) -> 
     if not is_hour(flown, now.timestamp()):
         return fail(
             name,
-            f"{label.title}: now is none of its days and hours ({label.when()})",
+            f"{label.title}: it does not allow spraying at this hour or day ({label.when()})",
             "wait for them; by the autopilot's clock the valves stay closed until then",
         )
     return ok(name, f"{label.title}: what is declared is kept; the rest is checked in flight")

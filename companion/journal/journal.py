@@ -218,7 +218,7 @@ class Journal:
             queue_rows: how far the disk may fall behind.
             waits: for simulations, faster than any disk: wait rather than drop.
             free_min_bytes: with less room on the disk the journal has a fault.
-            commit_every_s: what a cut of power may lose.
+            commit_every_s: what a power cut may lose.
             training: `no` for a product, else what it is: `water`, `dry`. None: nobody says.
             simulated: what is known at the start; an event of that kind says it later.
         """

@@ -57,7 +57,7 @@ def refused(path: Path, error: Exception) -> JournalError:
         if any(word in text for word in _KEPT_BACK):
             return JournalError(f"{path}: cannot be read: {text}")
         if "interrupted" in text:
-            return UnreadableError(f"{path}: is damaged: reading it comes to no end")
+            return UnreadableError(f"{path}: is damaged: reading it does not end")
     if isinstance(error, PermissionError):
         return JournalError(f"{path}: cannot be read: {text}")
     if isinstance(error, sqlite3.DatabaseError) and "not a database" in text:

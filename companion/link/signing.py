@@ -64,8 +64,8 @@ def read_key(path: Path) -> bytes:
     key = _key_of(content)
     if key is None:
         raise LinkError(
-            f"{where}: {len(content)} bytes are no key; write 32 bytes, 64 hexadecimal digits or "
-            "a passphrase in one line"
+            f"{where}: {len(content)} bytes are not a key; write 32 bytes, 64 hexadecimal digits "
+            "or a passphrase in one line"
         )
     return key
 

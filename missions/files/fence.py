@@ -478,7 +478,7 @@ def fence_warnings(plan: Plan, fences: Fences) -> tuple[str, ...]:
     if crossed:
         said.append(
             f"the fence leaves out {crossed} obstacle{'' if crossed == 1 else 's'} that ferries "
-            f"cross at {plan.settings.ferry_height_m:g} m: it knows no heights"
+            f"cross at {plan.settings.ferry_height_m:g} m: a fence has no heights"
         )
     if not most:
         return tuple(said)

@@ -117,7 +117,7 @@ def _altitude(item: dict[str, Any]) -> Problems:
 
 def _fence(fence: dict[str, Any]) -> Problems:
     if fence.get("version") != 2:
-        yield "geoFence.version must be 2, or the fence is ignored without a word"
+        yield "geoFence.version must be 2, or the fence is silently ignored"
     for name, key in (("polygons", "polygon"), ("circles", "circle")):
         shapes = fence.get(name)
         if not isinstance(shapes, list):

@@ -134,7 +134,10 @@ def zones(
     smooth_m: Annotated[
         float,
         typer.Option(
-            metavar="M", help="Most common zone within so many metres.", min=0.0, max=500.0
+            metavar="M",
+            help="Smooth: take the most common zone within this distance.",
+            min=0.0,
+            max=500.0,
         ),
     ] = 0.0,
     margin: Margin = MARGIN,
@@ -152,27 +155,29 @@ def zones(
     ] = None,
     cleaned: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Also write the points that are left: .csv, .geojson."),
+        typer.Option(metavar="FILE", help="Also write the points that were kept: .csv, .geojson."),
     ] = None,
     data_width_m: Annotated[
-        float | None, typer.Option(metavar="M", help="Between passes of points.", min=0.1)
+        float | None, typer.Option(metavar="M", help="Distance between passes of points.", min=0.1)
     ] = None,
     ends_m: Annotated[
         float | None,
-        typer.Option(metavar="M", help="Left out at both ends of a pass of points.", min=0.0),
+        typer.Option(
+            metavar="M", help="Length to leave out at both ends of a pass of points.", min=0.0
+        ),
     ] = None,
     as_is: Annotated[
-        bool, typer.Option("--as-is", help="Without the sprayer's limits, to compare.")
+        bool, typer.Option("--as-is", help="Ignore the sprayer's limits, to compare.")
     ] = False,
     crs: Annotated[
-        str | None, typer.Option(metavar="C", help="Of DATA, where it does not say.")
+        str | None, typer.Option(metavar="C", help="CRS of DATA, where it does not say.")
     ] = None,
     layer: Annotated[
-        str | None, typer.Option(metavar="L", help="Of DATA, where there are several.")
+        str | None, typer.Option(metavar="L", help="Layer of DATA, where there are several.")
     ] = None,
     png: Picture = None,
     format_name: FormatName = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace a map of this name.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing map.")] = False,
     overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
@@ -182,13 +187,13 @@ def zones(
     """
     if importlib.util.find_spec("scipy") is None:
         raise map_error(
-            data[0], "making zones takes the library scipy, which is not installed",
+            data[0], "making zones needs the library scipy, which is not installed",
             fix=f"install it with: {install_command('office')}", code="missing-library",
         )  # fmt: skip
     config = bounded(load(config_file, overrides=overrides or ()), boundary)
     wish = _wish(rates, law, litres_max, count, method, smooth_m, step_percent)
     if as_is and is_flight_map(out):
-        raise typer.BadParameter("--as-is is to compare, not to fly: name another format")
+        raise typer.BadParameter("--as-is makes a map to compare, not to fly: name another format")
     target = map_target(out)
     writer = writer_for(target, format_name)
     for path in (out, *(one for one in (png, cleaned) if one is not None)):
@@ -349,7 +354,7 @@ def _places(
         passes = replace(passes, edges_m=even)
     places = places_in(ground, passes, size_m=size_m, path=out)
     if not len(places.row):
-        raise PlanError(f"{field.boundary_file}: nothing of the field may be sprayed")
+        raise PlanError(f"{field.boundary_file}: no part of the field may be sprayed")
     return places
 
 

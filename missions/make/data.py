@@ -170,7 +170,7 @@ def in_degrees(points: Floats, crs: CRS | None, asked: str | None, path: Path) -
         if asked is None:
             raise map_error(
                 path,
-                "its coordinates are no degrees, and it does not say its coordinate system",
+                "its coordinates are not degrees, and it does not say its coordinate system",
                 fix="give it with --crs, such as EPSG:32633",
                 code="no-crs",
             )
@@ -279,7 +279,7 @@ def _index(path: Path, grid: Grid, index: str, wanted: Wanted) -> Floats:
             shown = ", ".join(f"{at} {band.name}" for at, band in enumerate(grid.bands[:12], 1))
             raise map_error(
                 path,
-                f"{index} takes a band {colour}, and none is called so; its bands are {shown}",
+                f"{index} takes a band {colour}, and no band has that name; its bands are {shown}",
                 fix=f"say which it is with --band {colour}=NUMBER",
                 code="no-band",
             )
@@ -460,7 +460,7 @@ MISSING_MAX = 0.5
 def _elsewhere(path: Path, share: float) -> MapError:
     return map_error(
         path,
-        f"{100 * share:.0f} % of the field have no data",
+        f"{100 * share:.0f} % of the field has no data",
         fix="check that data and boundary are of the same field, and --crs if you gave it",
         code="no-data",
     )

@@ -251,11 +251,14 @@ CourseDeg = Annotated[
 ]
 Margin = Annotated[
     float,
-    typer.Option(metavar="X", help="Times the length that a change takes.", min=1.0, max=20.0),
+    typer.Option(
+        metavar="X", help="Safety factor on the length that a change takes.", min=1.0, max=20.0
+    ),
 ]
 Picture = Annotated[
     Path | None, typer.Option("--png", metavar="FILE", help="Picture: .png, .svg or .pdf.")
 ]
 FormatName = Annotated[
-    str | None, typer.Option("--format", metavar="F", help="Where the suffix can hold several.")
+    str | None,
+    typer.Option("--format", metavar="F", help="Format, where the suffix allows several."),
 ]

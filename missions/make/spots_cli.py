@@ -111,12 +111,16 @@ def spots(
         typer.Option(metavar="M", help="How exactly weeds are located, 1 sd.", min=0.0, max=10.0),
     ] = 0.1,
     radius_m: Annotated[
-        float, typer.Option(metavar="M", help="Of a weed that is a point.", min=0.0, max=20.0)
+        float,
+        typer.Option(metavar="M", help="Radius of a weed that is a point.", min=0.0, max=20.0),
     ] = 0.1,
     position_m: Annotated[
         float | None,
         typer.Option(
-            metavar="M", help="Of the aircraft, 1 sd; default: by safety.fix.", min=0.0, max=10.0
+            metavar="M",
+            help="Position error of the aircraft, 1 sd; default: by safety.fix.",
+            min=0.0,
+            max=10.0,
         ),
     ] = None,
     wind_m_s: Annotated[
@@ -124,24 +128,26 @@ def spots(
     ] = 2.0,
     miss_percent: Annotated[
         float,
-        typer.Option(metavar="PCT", help="Chance to miss a weed, at most.", min=0.01, max=50.0),
+        typer.Option(metavar="PCT", help="Largest chance of missing a weed.", min=0.01, max=50.0),
     ] = 2.0,
     mission: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Also the quickest mission: .plan, .waypoints, ..."),
+        typer.Option(
+            metavar="FILE", help="Also write the quickest mission: .plan, .waypoints, ..."
+        ),
     ] = None,
     boundary: Boundary = None,
     no_spray: NoSpray = None,
     angle_deg: CourseDeg = None,
     crs: Annotated[
-        str | None, typer.Option(metavar="C", help="Of WEEDS, where it does not say.")
+        str | None, typer.Option(metavar="C", help="CRS of WEEDS, where it does not say.")
     ] = None,
     layer: Annotated[
-        str | None, typer.Option(metavar="L", help="Of WEEDS, where there are several.")
+        str | None, typer.Option(metavar="L", help="Layer of WEEDS, where there are several.")
     ] = None,
     png: Picture = None,
     format_name: FormatName = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace files of these names.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
     overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:

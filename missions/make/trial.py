@@ -208,7 +208,7 @@ def trial(
     ],
     check: Annotated[
         float | None,
-        typer.Option(metavar="R", help="L/ha of a check in every block.", min=0.0),
+        typer.Option(metavar="R", help="L/ha of a check plot in every block.", min=0.0),
     ] = None,
     blocks: Annotated[
         int, typer.Option(metavar="N", help="Repeats of all treatments.", min=2, max=BLOCKS_MAX)
@@ -226,7 +226,10 @@ def trial(
     guard_m: Annotated[
         float,
         typer.Option(
-            metavar="M", help="At both sides of a plot, not harvested.", min=0.0, max=100.0
+            metavar="M",
+            help="Strip on both sides of a plot that is not harvested.",
+            min=0.0,
+            max=100.0,
         ),
     ] = 0.5,
     headland_m: Annotated[
@@ -237,14 +240,14 @@ def trial(
     ] = None,
     margin: Margin = MARGIN,
     seed: Annotated[
-        int, typer.Option(metavar="N", help="Of the random order; it is recorded.", min=0)
+        int, typer.Option(metavar="N", help="Seed of the random order; it is recorded.", min=0)
     ] = 1,
     boundary: Boundary = None,
     no_spray: NoSpray = None,
     angle_deg: CourseDeg = None,
     png: Picture = None,
     format_name: FormatName = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace a map of this name.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing map.")] = False,
     overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:

@@ -437,7 +437,7 @@ def read_table(content: bytes, path: Path, *, geometry_of: Callable[[bytes | Non
     except ImportError:
         raise map_error(
             path,
-            "reading GeoParquet takes the library pyarrow, which is not installed",
+            "reading GeoParquet needs the library pyarrow, which is not installed",
             fix=f"install it with: {install_command('office')}",
             code="missing-library",
         ) from None

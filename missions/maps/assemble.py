@@ -105,9 +105,7 @@ def map_of(
     if isinstance(found, Grid):
         return _map_of_grid(found, path, rate_field=rate_field, crs=crs, given=given)
     if not found.geometries:
-        raise map_error(
-            path, "there is no record in it", fix="export the zones again", code="no-polygon"
-        )
+        raise map_error(path, "it has no records", fix="export the zones again", code="no-polygon")
     used_crs, crs_problems = crs_of(found, path, crs)
     if not found.columns:
         raise map_error(
@@ -200,7 +198,7 @@ def crs_of(layer: Layer | Grid, path: Path, asked: str | None) -> tuple[CRS, lis
                 Problem(
                     severity="warning",
                     code="crs-overridden",
-                    text=f"the file says {crs_name(layer.crs)}, {crs_name(crs)} is used as asked",
+                    text=f"the file says {crs_name(layer.crs)}, but you asked for {crs_name(crs)}",
                     where=str(path),
                     fix="leave out --crs (prescription.crs) to believe the file",
                 )

@@ -346,7 +346,7 @@ def _check_members(path: Path, members: Sequence[zipfile.ZipInfo]) -> None:
                 fix="pack it as a plain zip (deflate)",
             )
         if member.file_size > max(MAX_RATIO * member.compress_size, _RATIO_FREE_BYTES):
-            raise _unsafe(path, f"its member {shown} unpacks without measure")
+            raise _unsafe(path, f"its member {shown} unpacks to far more than its size")
         if stat.S_ISLNK(member.external_attr >> 16):
             raise _unsafe(path, f"its member {shown} is a link", fix="pack the file itself")
 

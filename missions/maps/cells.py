@@ -74,7 +74,7 @@ def bounds_deg(cells: MapCells) -> tuple[float, float, float, float]:
 
 
 def check_place(cells: MapCells, path: Path) -> None:
-    """Refuse cells that are no place on earth, or reach too far."""
+    """Refuse cells that are not on Earth, or reach too far."""
     try:
         west, south, east, north = bounds_deg(cells)
     except ProjError as error:
@@ -88,7 +88,7 @@ def check_place(cells: MapCells, path: Path) -> None:
 
 
 def _nowhere(cells: MapCells, path: Path, box: tuple[float, float, float, float]) -> MapError:
-    """Return the refusal of cells that are no place on earth, with the likely reason."""
+    """Return the refusal of cells that are not on Earth, with the likely reason."""
     west, south, east, north = box
     fix, code = "give the right CRS with --crs", "out-of-range"
     if cells.crs.is_geographic and max(abs(south), abs(north)) <= 90.0:
@@ -100,8 +100,7 @@ def _nowhere(cells: MapCells, path: Path, box: tuple[float, float, float, float]
         fix, code = "give with --crs the projection that it was made in", "wrong-crs"
     return map_error(
         path,
-        f"its cells (x {west:.6g} to {east:.6g}, y {south:.6g} to {north:.6g}) are no place on "
-        "earth",
+        f"its cells (x {west:.6g} to {east:.6g}, y {south:.6g} to {north:.6g}) are not on Earth",
         fix=fix,
         code=code,
     )

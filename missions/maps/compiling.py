@@ -135,7 +135,7 @@ def read_ordered_map(order: MapOrder) -> MapFile:
     if is_source and table.sha256 is not None and not found.sha256.startswith(table.sha256):
         raise order.refused(
             f"prescription.sha256 = {show_value(table.sha256)}: {table.file} is another map, its "
-            f"hash begins with {found.sha256[:8]}; look at it by `vrspray map check`, then write "
+            f"hash begins with {found.sha256[:8]}; look at it with `vrspray map check`, then write "
             "these digits"
         )
     return found

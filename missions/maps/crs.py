@@ -298,7 +298,7 @@ def check_extent(box: _Box, path: Path) -> None:
 
 
 def _out_of_range(raw: Floats, crs: CRS, path: Path) -> MapError:
-    """Return the refusal of coordinates that are no place on earth, with the likely reason."""
+    """Return the refusal of coordinates that are not on Earth, with the likely reason."""
     x, y = np.abs(raw).T
     if crs.is_geographic and (x <= 90.0).all() and (y <= 180.0).all():
         return _swapped(raw, crs, path)

@@ -124,7 +124,7 @@ def choose(columns: Sequence[Source], *, asked: str | None, path: Path) -> Choic
     if not usable and len(blank) == 1:
         raise map_error(
             path,
-            f"{blank[0].name} holds no rate at all",
+            f"{blank[0].name} is blank in every record",
             fix="give the zones a rate, 0 for none, or name another column with --rate-field "
             "(prescription.rate_field)",
             code="null-rate",
@@ -405,9 +405,9 @@ def _refuse_other_quantity(
             continue
         raise map_error(
             path,
-            f"{rate.name} is in {text[:40]!r}: {quantity}, and no volume per area"
+            f"{rate.name} is in {text[:40]!r}: {quantity}, not a volume per area"
             if text != rate.name
-            else f"{rate.name} is {quantity} by its name, and no volume per area",
+            else f"{rate.name} is {quantity} by its name, not a volume per area",
             fix=layer.instead
             or "name a column with a volume per area with --rate-field (prescription.rate_field), "
             "or make the map in L/ha",
@@ -428,7 +428,7 @@ def _in_litres(
     if l_ha is None and found.kind == "mass":
         raise map_error(
             path,
-            f"its unit {found.name!r} is a weight, and no volume per area",
+            f"its unit {found.name!r} is a weight, not a volume per area",
             fix="give the density of what is sprayed with --density-kg-l "
             f"(prescription.density_kg_l), or {instead or 'make the map in L/ha'}",
             code="not-a-volume",
@@ -436,7 +436,7 @@ def _in_litres(
     if l_ha is None:
         raise map_error(
             path,
-            f"its unit {found.name!r} is a flow, and no volume per area",
+            f"its unit {found.name!r} is a flow, not a volume per area",
             fix="give the width and the speed that the map was made for with --flow-width-m and "
             "--flow-speed-m-s (prescription.flow_width_m, flow_speed_m_s)",
             code="not-a-volume",
@@ -477,7 +477,7 @@ def _overridden(unknown: Sequence[str], wanted: str, rate: Column | Band) -> lis
         Problem(
             severity="warning",
             code="unit-overridden",
-            text=f"the file's unit {unknown[0][:40]!r} is not understood; {wanted} holds, as asked",
+            text=f"the file's unit {unknown[0][:40]!r} is not understood; {wanted} is used",
             where=rate.name,
             fix="make sure that it means the same",
         )

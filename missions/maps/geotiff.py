@@ -68,7 +68,7 @@ def read_geotiff(path: Path, layer: str | None = None) -> Grid:
 
 
 def read_bands(path: Path, layer: str | None = None) -> Grid:
-    """Return the bands of a GeoTIFF as measurements, which are no rates and may be negative."""
+    """Return the bands of a GeoTIFF as measurements, which are not rates and may be negative."""
     bundle = files_beside(path)
     content = bundle.read(path.name)
     raster = read_raster(content, path, layer=layer, described=False, colours=True)

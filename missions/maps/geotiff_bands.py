@@ -174,7 +174,7 @@ def _fault(raw: RawBand, values: NDArray[np.float64], path: Path) -> MapError | 
     return map_error(
         path,
         f"{raw.name} holds {float(found[0]):.6g} in row {row + 1}, column {column + 1}, and "
-        f"{len(found)} such numbers in all, which are no rates",
+        f"{len(found)} such numbers in all, which are not rates",
         fix="correct the values, or export the map again",
         code="bad-rate",
     )

@@ -65,7 +65,7 @@ def gdal(path: Path) -> Any:
     except ImportError:
         raise map_error(
             path,
-            "reading and writing GeoTIFF takes the library rasterio, which is not installed",
+            "reading and writing GeoTIFF needs the library rasterio, which is not installed",
             fix=f"install it with: {install_command('office')}",
             code="missing-library",
         ) from None
@@ -228,7 +228,7 @@ def _transform(source: Any, path: Path) -> Affine | None:
     if not (a * e - b * d != 0.0 and all(abs(value) <= 1e9 for value in (a, b, c, d, e, f))):
         raise map_error(
             path,
-            "its cells have no size, or are no place on earth",
+            "its cells have no size, or are not on Earth",
             fix="export the map again",
             code="not-georeferenced",
         )

@@ -240,7 +240,7 @@ def read_records(path: Path, *, crs: str | None = None, layer: str | None = None
             raise map_error(
                 path,
                 f"record {names[index]} is not an area, point or line: {reason}",
-                fix="draw it anew, or delete the record",
+                fix="draw it again, or delete the record",
                 code="no-polygon",
             )
     found: dict[int, BaseGeometry] = {}
@@ -270,7 +270,7 @@ def _no_grid(layer: Layer | Grid, path: Path) -> Layer:
     if isinstance(layer, Grid):
         raise map_error(
             path,
-            "rows and columns of cells are no outline",
+            "rows and columns of cells are not an outline",
             fix="give the boundary or the exclusion as polygons",
             code="no-polygon",
         )

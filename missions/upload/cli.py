@@ -67,10 +67,11 @@ def upload(
     ] = False,
     all_sorties: Annotated[
         bool,
-        typer.Option("--all", help="Then each later sortie, when the one before is flown."),
+        typer.Option("--all", help="Upload each later sortie once the one before is flown."),
     ] = False,
     wait_s: Annotated[
-        float, typer.Option(metavar="S", help="For the vehicle.", min=1.0, max=600.0)
+        float,
+        typer.Option(metavar="S", help="How long to wait for the vehicle.", min=1.0, max=600.0),
     ] = WAIT_S,
     as_json: AsJson = False,
 ) -> None:

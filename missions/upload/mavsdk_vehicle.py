@@ -33,9 +33,9 @@ REQUESTS = ("MISSION_REQUEST_INT", "MISSION_REQUEST")
 PASSING = ("TIMEOUT", "BUSY", "TRANSFER_CANCELLED", "PROTOCOL_ERROR", "INVALID_SEQUENCE", "ERROR")
 REASONS = {
     "TOO_MANY_MISSION_ITEMS": "it has no room for {count} items; upload one sortie at a time",
-    "UNSUPPORTED": "it does not take an item of it, or no {what} at all",
+    "UNSUPPORTED": "it rejects an item of it, or any {what} at all",
     "DENIED": "another ground station is uploading, or its configuration forbids it",
-    "INVALID_ARGUMENT": "an item has a parameter that it does not take",
+    "INVALID_ARGUMENT": "an item has a parameter that it rejects",
 }
 
 

@@ -234,7 +234,7 @@ async def until_flown(vehicle: Watched, last: int, *, say: Callable[[str], None]
                 return
             say(
                 f"landed at item {flight.farthest} of {last}: the sortie is not flown to its end; "
-                "fly the rest of it, or stop here and plan it anew (plan --resume)"
+                "fly the rest of it, or stop here and plan the rest again (plan --resume)"
             )
 
 

@@ -227,7 +227,7 @@ class Office:
                 await _written(part, name, request, room)
             part.replace(self.given / name)
         except TimeoutError as error:
-            raise HTTPException(408, f"{name}: came too slowly; try again") from error
+            raise HTTPException(408, f"{name}: arrived too slowly; try again") from error
         except OSError as error:
             reason = (error.strerror or "cannot be written").lower()
             raise HTTPException(413, f"{name}: not kept on this computer: {reason}") from error

@@ -42,7 +42,7 @@ class RunIsUnsaid(TyperGroup):
 
 app = typer.Typer(
     cls=RunIsUnsaid,
-    help="Fly many simulated flights over settings: vrspray campaign FILE. Show what they say.",
+    help="Simulate many flights, varying settings: vrspray campaign FILE. Show the results.",
     epilog="Example: vrspray campaign lags.toml --out lags && vrspray campaign show lags",
     no_args_is_help=True,
     add_completion=False,
@@ -61,7 +61,7 @@ def run(
         ),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(metavar="N", help="Flights at a time. Default: one a core.")
+        int | None, typer.Option(metavar="N", help="Flights at a time. Default: one for each core.")
     ] = None,
     cluster: Annotated[
         str | None,
@@ -74,7 +74,7 @@ def run(
 ) -> None:
     """Fly all flights of a campaign file into a Parquet dataset.
 
-    The same command goes on where it was stopped. A flight that fails is a row with its error.
+    Run the same command again to continue. A flight that fails is a row with its error.
     Exit 0: flown; 1: no flight could be flown; 2: file or option is wrong; 130: interrupted.
     """
     from sitl.campaign.bundle import bundle_of
@@ -142,8 +142,8 @@ def _flown(dataset: Dataset, bundle: Bundle, workers: Workers, done: int, *, qui
     except KeyboardInterrupt:
         left = sum(len(dataset.flights_of(part)) for part in dataset.missing())
         raise StoppedError(
-            f"interrupted: {total - left} of {total} flights are kept in {dataset.folder}; the "
-            "same command goes on"
+            f"interrupted: {total - left} of {total} flights are kept in {dataset.folder}; run "
+            "the same command again to continue"
         ) from None
     finally:
         dataset.log({"started": round(started, 3), **tally.as_json()})
@@ -217,7 +217,7 @@ def show(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a campaign's dataset.")],
     figure: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME", help="Figure to show; may be repeated. Default: five."),
+        typer.Option(metavar="NAME", help="Figure to show; repeatable. Default: five."),
     ] = None,
     by: Annotated[
         str | None,
@@ -228,9 +228,7 @@ def show(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show each figure of a campaign by setting, with its interval.
-
-    And which settings matter for it.
+    """Show each figure by setting, and which settings matter.
 
     Exit 0: shown; 2: the folder or an option is wrong.
     """

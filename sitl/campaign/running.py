@@ -442,7 +442,9 @@ def _take(flying: _Flying, future: Future[Answer]) -> None:
     elif isinstance(error, OtherCodeError):
         raise error
     elif isinstance(error, CancelledError) or type(error).__name__ == "FutureCancelledError":
-        raise VrsprayError("the cluster is gone; start it, and the same command goes on")
+        raise VrsprayError(
+            "the cluster is gone; start it, then run the same command again to continue"
+        )
     else:
         raise error
 

@@ -190,7 +190,10 @@ def test_what_is_no_question_to_the_flights_is_refused_in_one_line(
 def test_memory_has_a_limit(fleet: Path, capsys: Captured) -> None:
     sql = "SELECT list(a) FROM range(40000000) t(a)"
     code, _, err = run(capsys, "query", sql, "--fleet", str(fleet), "--memory-mb", "60")
-    assert (code, err) == (2, "error: SQL: it takes too much memory; give more by --memory-mb\n")
+    assert (code, err) == (
+        2,
+        "error: SQL: the query needs too much memory; allow more with --memory-mb\n",
+    )
 
 
 @pytest.mark.parametrize(

@@ -172,7 +172,7 @@ def test_what_is_refused_leaves_no_folder(
     (tmp_path / "page.md").write_text("no picture")
     out = tmp_path / "made" / "out"
     assert execute(["wsp", str(tmp_path / "page.md"), "--out", str(out)]) == 2
-    assert "is no image" in capsys.readouterr().err
+    assert "is not an image" in capsys.readouterr().err
     assert not out.parent.exists()
 
 

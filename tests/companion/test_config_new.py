@@ -149,9 +149,9 @@ def test_every_profile_becomes_a_configuration(name: str, tmp_path: Path, capsys
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--autopilot", "betaflight"], "no autopilot; write ardupilot or px4"),
+        (["--autopilot", "betaflight"], "not an autopilot; write ardupilot or px4"),
         (["--link", "COM3"], "link.url"),
-        (["--output", "relay"], "no output; write servo 9, or gpio 5"),
+        (["--output", "relay"], "not an output; write servo 9, or gpio 5"),
         (["--valves", "0"], "number of valves"),
         (["--nozzle", "blue"], "flow of one valve"),
         (["--profile", "none"], "not known; write a .toml file, or one of"),

@@ -185,7 +185,7 @@ def test_a_key_that_others_can_touch_is_refused(tmp_path: Path, mode: int) -> No
     [b"", b"\n", b"short", KEY[:31], KEY + b"\n\xff", b"x" * 1025, b"\xff" * 33, b"\xc3\xa4" * 10],
 )
 def test_what_is_no_key_is_refused_and_not_shown(tmp_path: Path, content: bytes) -> None:
-    with pytest.raises(LinkError, match=r"^[^\n]*are no key; write[^\n]*$") as refused:
+    with pytest.raises(LinkError, match=r"^[^\n]*are not a key; write[^\n]*$") as refused:
         read_key(key_file(tmp_path, content))
     assert "short" not in str(refused.value)
 

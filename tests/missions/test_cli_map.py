@@ -310,7 +310,7 @@ def test_overlap_policy_is_asked_for_check_and_rate(capsys: Captured, tmp_path: 
     assert (code, found["ok"]) == (1, False)
     code, found = run_json(capsys, "check", *given, "--overlap", "max")
     assert (code, found["ok"]) == (0, True)
-    assert "the larger rate holds there" in found["problems"][0]["text"]
+    assert "the larger rate applies there" in found["problems"][0]["text"]
     for policy, rate_l_ha in (("max", 30.0), ("min", 10.0), ("mean", 20.0), ("last", 30.0)):
         place = ("36.0005", "114.5015", "--overlap", policy)
         assert run_json(capsys, "rate", *given, *place)[1]["rate_l_ha"] == rate_l_ha

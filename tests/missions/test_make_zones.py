@@ -488,5 +488,5 @@ def test_without_scipy_the_extra_is_named(
 def test_data_of_another_place_are_refused(data: Path, tmp_path: Path) -> None:
     far = tmp_path / "far.csv"
     far.write_text("lat,lon,ec\n" + "".join(f"48.3,16.{90 + i},1.{i}\n" for i in range(9)))
-    with pytest.raises(VrsprayError, match="100 % of the field have no data"):
+    with pytest.raises(VrsprayError, match="100 % of the field has no data"):
         run(far, "--config", data / "config.toml", "--rates", "9,12", "--out", tmp_path / "a.shp")

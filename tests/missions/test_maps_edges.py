@@ -86,7 +86,7 @@ def test_a_rate_column_without_a_number_is_named(tmp_path: Path) -> None:
     box = (11.0, 48.0, 11.001, 48.001)
     found = refused(zones(tmp_path / "rx.geojson", [box], rate=[None], level=[3.0]), unit="L/ha")
     assert found.code == "null-rate"
-    assert "rate holds no rate" in str(found)
+    assert "rate is blank in every record" in str(found)
 
 
 def test_numbers_written_as_text_are_numbers(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ CASES = [
     Case(
         code="overlap",
         given=a_map((cell(0), 10.0), (cell(0.5), 20.0)),
-        says="the larger rate holds there",
+        says="the larger rate applies there",
         place="zone0 and zone1",
         overlap="max",
     ),

@@ -130,7 +130,7 @@ BROKEN: list[tuple[Callable[[Any], Any], str, bool]] = [
     (lambda c: c["mission"]["items"][1].update(doJumpId=1), "one doJumpId", False),
     (lambda c: c["mission"]["items"][1].update(command=177, params=[99, 1, 0, 0, 0, 0, 0]),
      "jumps to 99", False),
-    (lambda c: c["geoFence"].update(version=1), "ignored without a word", True),
+    (lambda c: c["geoFence"].update(version=1), "silently ignored", True),
     (lambda c: c["geoFence"].pop("circles"), "circles must be a list", True),
     (lambda c: c["geoFence"]["polygons"][0].pop("inclusion"), "polygons 1", True),
     (lambda c: c["geoFence"]["polygons"][0].update(polygon=[[1, 2], [3, 4]]), "polygons 1", True),

@@ -242,7 +242,7 @@ def test_heights_in_an_unknown_unit_are_refused(tmp_path: Path) -> None:
     [
         ("dem.asc", b"", "GeoTIFF"),
         ("alps.hgt", b"", "N48E011.hgt"),
-        ("N48E011.hgt", b"12", "2 bytes are no tile"),
+        ("N48E011.hgt", b"12", "2 bytes are not a tile"),
         ("dem.tif", b"no tiff", "not a TIFF"),
         (None, b"", "no such file"),
     ],

@@ -51,7 +51,7 @@ def test_what_was_flown_is_kept_and_the_same_command_goes_on(
     said = capsys.readouterr()
     assert said.out == ""
     assert said.err.strip() == (
-        f"interrupted: 10 of 24 flights are kept in {out}; the same command goes on"
+        f"interrupted: 10 of 24 flights are kept in {out}; run the same command again to continue"
     )
     assert execute(["campaign", str(file), "--out", str(out)]) == 0
     assert "10 of 24 flights are there already" in capsys.readouterr().err

@@ -34,7 +34,7 @@ function markOf(flight) {
 function showFlights() {
   const flights = state.flights ?? [];
   byId("none").hidden = flights.length > 0;
-  byId("none").textContent = state.error ?? (state.flights ? "No flights yet." : "Not looked yet.");
+  byId("none").textContent = state.error ?? (state.flights ? "No flights yet." : "Not checked yet.");
   byId("flights").replaceChildren(...flights.map((flight) => {
     const item = make("li"), words = make("div"), button = make("button", "Report");
     const parts = [];
@@ -76,7 +76,7 @@ function leftOf(told) {
     parts.push(row);
   }
   if (told.is_open && facts.spares_treated) parts.push(make("p", "In this run: release STOP, enable, and fly the same mission again. Valves stay closed over ground that is treated."));
-  const after = make("p", told.is_open ? "After a restart of the companion: " : "With the next start of the companion: ");
+  const after = make("p", told.is_open ? "After a restart of the companion: " : "The next time the companion starts: ");
   after.append(make("code", `vrspray run --config … --continue ${state.journals}/${told.file}`));
   parts.push(after);
   return parts;
@@ -90,7 +90,7 @@ function showReport() {
   const parts = told.marks.map((text) => make("p", text, "mark-text"));
   if (told.error) parts.push(make("p", told.error, "refused"));
   if (told.verdict) parts.push(make("p", told.verdict.sentence, "verdict"));
-  if (told.is_open) parts.push(make("p", "The run that flew it is still being recorded: this is what it holds up to now. End the run for the final report.", "small"));
+  if (told.is_open) parts.push(make("p", "The run that flew it is still being recorded: this is what it holds so far. End the run for the final report.", "small"));
   const row = make("p");
   if (told.files.includes("report.html")) row.append(linkTo(told, "report.html", "Open the report"));
   for (const name of told.files.filter((one) => one !== "report.html" && !one.startsWith("."))) row.append(linkTo(told, name, name));

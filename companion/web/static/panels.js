@@ -143,7 +143,7 @@ export function showChecklist(state, facts, ground, checks) {
     ["Outputs", none("output-fault", "leak", "valve-stuck-open", "no-flow", "flow-fault"), facts.output === "none" ? "no outputs: dry run" : facts.output],
     ["No stop pressed", none("estop", "rearm-needed"), ""],
     ["Wind", none("wind-above-max", "wind-unknown"), vehicle.wind_m_s === null || vehicle.wind_m_s === undefined ? `not measured; at most ${withUnit("wind", facts.wind_max_m_s)}` : withUnit("wind", vehicle.wind_m_s)],
-    ["Tank", level === null || level === undefined ? null : level > (facts.reserve_l ?? 0), level === null || level === undefined ? "say what is in it, below Tank" : withUnit("volume", level)],
+    ["Tank", level === null || level === undefined ? null : level > (facts.reserve_l ?? 0), level === null || level === undefined ? "enter what is in it under Tank" : withUnit("volume", level)],
     ["Record", !state.journal?.fault, state.journal?.name ?? ""],
     ["Product", facts.training !== "no" ? null : Boolean(facts.product), facts.training === "no" ? facts.product || "product.name is not set" : `training: ${facts.training}`],
   ];
@@ -166,7 +166,7 @@ export function showTank(state, facts) {
   const flow = state.meter_l_min ?? state.flow_l_min;
   const isLow = level !== null && level !== undefined && level <= Math.max(facts.reserve_l ?? 0, 0.1 * (full ?? 0));
   bar.classList.toggle("low", isLow);
-  const parts = [level === null || level === undefined ? "Not known: say what is in it." : `${withUnit("volume", level)}${full ? ` of ${withUnit("volume", full)}` : ""}`];
+  const parts = [level === null || level === undefined ? "Not known: enter what is in it." : `${withUnit("volume", level)}${full ? ` of ${withUnit("volume", full)}` : ""}`];
   if (level !== null && level !== undefined && flow > 0.05) parts.push(`${(level / flow).toFixed(1)} min at this flow`);
   if (level !== null && level !== undefined && !facts.has_tank_sensor) parts.push("counted down by the ordered flow");
   text(byId("tank-text"), parts.join(" · "));

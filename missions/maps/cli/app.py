@@ -190,7 +190,7 @@ def offset(
     if not distance_m <= PLAUSIBLE_M:
         raise MapError(
             f"--surveyed lies {distance_m:.1f} m from --map, more than {PLAUSIBLE_M:.0f} m; check "
-            "that both are the same mark, the latitude first",
+            "that both are the same mark, each with the latitude first",
             code="wrong-mark",
         )
     result = {"offset_east_m": east_m, "offset_north_m": north_m, "distance_m": distance_m}

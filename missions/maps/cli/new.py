@@ -30,23 +30,23 @@ from missions.maps.text_points import (
 
 GRID_EXAMPLE = "Example: vrspray map grid field.txt --origin 37.85,-4.8,120 --merge mean --json"
 
-Force = Annotated[bool, typer.Option("--force", help="Overwrite the file.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace an existing file.")]
 
 
 def grid(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="P2's text map.")],
     origin: Annotated[
         str | None,
-        typer.Option(metavar="LAT,LON,ALT", help="Of the plane; the first point without it."),
+        typer.Option(metavar="LAT,LON,ALT", help="Origin of the plane; default: the first point."),
     ] = None,
     merge: Annotated[
         str, typer.Option(metavar="HOW", help="Several points in a cell: max, average or mean.")
     ] = "max",
     cell_m: Annotated[
-        int | None, typer.Option(metavar="M", help="In place of the map's own cell size.", min=1)
+        int | None, typer.Option(metavar="M", help="Cell size; default: the map's own.", min=1)
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="CSV", help="Write the cells with a rate.")
+        Path | None, typer.Option("--out", metavar="CSV", help="Write the cells that have a rate.")
     ] = None,
     force: Force = False,
     as_json: AsJson = False,

@@ -38,7 +38,8 @@ _Layer = Annotated[
     str | None, typer.Option(metavar="L", help="Layer or task, where there are several.")
 ]
 _Density = Annotated[
-    float | None, typer.Option(metavar="KG_PER_L", help="Of the product, for rates by weight.")
+    float | None,
+    typer.Option(metavar="KG_PER_L", help="Density of the product, for rates by weight."),
 ]
 _FlowWidth = Annotated[
     float | None, typer.Option(metavar="M", help="Width for which a map in L/min was made.")
@@ -59,7 +60,7 @@ OverlapPolicy = Annotated[
     typer.Option(
         "--overlap",
         metavar="P",
-        help="Where zones overlap: max, min, mean or last holds; error refuses.",
+        help="Rate where zones overlap: max, min, mean or last; error refuses the map.",
     ),
 ]
 
@@ -77,7 +78,7 @@ _ConfigFile = Annotated[
     typer.Option(
         "--config",
         metavar="FILE",
-        help="Of the flight; what is not given here comes from it.",
+        help="Configuration of the flight; supplies what is not given here.",
     ),
 ]
 

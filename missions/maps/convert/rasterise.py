@@ -224,7 +224,7 @@ def _refuse_overlaps(map_file: MapFile, zones: list[MapZone]) -> None:
             map_file.path,
             f"zones {first.name} and {second.name} overlap by {found[0].area_m2:.1f} m2, and a "
             "cell has one rate",
-            fix="correct the map, or say what holds with --overlap max, min, mean or last",
+            fix="correct the map, or choose a rate with --overlap max, min, mean or last",
             code="overlap",
         )
 

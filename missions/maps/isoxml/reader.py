@@ -147,7 +147,7 @@ class TaskFiles:
             if tag(external) != "XFC":
                 raise map_error(
                     self.path,
-                    f"its external file {name[:40]} is no part of a task ({tag(external)[:40]})",
+                    f"its external file {name[:40]} is not part of a task ({tag(external)[:40]})",
                     fix=EXPORT_AGAIN,
                     code="unknown-format",
                 )
@@ -433,7 +433,7 @@ def _by_codes(
         raise map_error(
             path,
             f"{int(counts[undefined].sum())} of {codes.size} cells of its grid have codes that "
-            f"are no treatment zone of task {task.id[:40]}: {shown}",
+            f"are not treatment zones of task {task.id[:40]}: {shown}",
             fix="export the task again with all of its treatment zones",
             code="undefined-code",
         )

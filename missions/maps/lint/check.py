@@ -238,7 +238,7 @@ def rate_problems(survey: Survey, default_rate_l_ha: float | None) -> list[Probl
             Problem(
                 severity="warning",
                 code="high-rate",
-                text=f"the largest rate is {most:.0f} L/ha, more than any sprayer's use",
+                text=f"the largest rate is {most:.0f} L/ha, more than any sprayer applies",
                 where=f"{survey.map_file.rate_field}: {survey.rate_spots(most)}",
                 fix="check the rate column (--rate-field) and its unit (--unit)",
             )

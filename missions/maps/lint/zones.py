@@ -36,10 +36,10 @@ SLIVER_WIDTH_M = 0.1
 GAP_WIDTH_M = 1.0
 GAP_MIN_M2 = 1.0
 _POLICIES = {
-    "max": "the larger rate holds there",
-    "min": "the smaller rate holds there",
-    "mean": "the mean of their rates holds there",
-    "last": "the one later in the file holds there",
+    "max": "the larger rate applies there",
+    "min": "the smaller rate applies there",
+    "mean": "the mean of their rates applies there",
+    "last": "the one later in the file applies there",
 }
 
 

@@ -265,7 +265,7 @@ async function makeZones() {
   const body = wish();
   if (!body.rates_l_ha.length || body.rates_l_ha.some(Number.isNaN)) { say("Rates are numbers, one for each zone: 26 22 18 14.", true); return; }
   if (!body.field || (body.kind !== "trial" && (!body.data || body.data === body.field))) { say("Load the data and a boundary, or draw the boundary.", true); return; }
-  if (body.kind === "trial" && body.rest_l_ha === undefined) { say("Say which rate the ground around the plots gets.", true); return; }
+  if (body.kind === "trial" && body.rest_l_ha === undefined) { say("Enter the rate for the ground around the plots.", true); return; }
   await doing(byId("make-button").textContent.replace("Make", "Making"), () => ask("office/make", body));
   if (!state.make || state.make.error) return;
   // The zones fit these passes and no others.
