@@ -310,21 +310,37 @@ LEAST_M2 = 1e-9
 
 
 def with_corners(border: Polygon, allowed: BaseGeometry, most: int) -> Polygon:
-    """Return a border around all of another one with so many corners, or as few as it takes.
+    """Return a border around all of another one with so many corners, or as few as it takes."""
+    return FewerAndFewer(border, allowed).with_corners(most)
 
-    Step by step a corner inwards is left out, or an edge whose neighbours then meet farther out,
-    whichever adds least ground; what is added lies within `allowed`.
+
+class FewerAndFewer:
+    """Borders around all of another one, each with one corner less than the one before.
+
+    A corner inwards is left out, or an edge whose neighbours then meet farther out, whichever adds
+    least ground; what is added lies within `allowed`. They are drawn as far as they are asked for.
     """
-    shapely.prepare(allowed)
-    points = shapely.get_coordinates(orient(Polygon(border.exterior)).exterior)[:-1]
-    while len(points) > max(most, 3):
-        for fewer, added in _steps(points):
-            if Polygon(fewer).is_valid and (added.area <= LEAST_M2 or allowed.covers(added)):
-                points = fewer
+
+    def __init__(self, border: Polygon, allowed: BaseGeometry) -> None:
+        shapely.prepare(allowed)
+        self._allowed = allowed
+        self._drawn = [shapely.get_coordinates(orient(Polygon(border.exterior)).exterior)[:-1]]
+
+    def with_corners(self, most: int) -> Polygon:
+        """Return the first border with so many corners, or the last one that there is."""
+        while len(self._drawn[-1]) > max(most, 3):
+            fewer = self._next(self._drawn[-1])
+            if fewer is None:
                 break
-        else:
-            break
-    return Polygon(points)
+            self._drawn.append(fewer)
+        fits = (points for points in self._drawn if len(points) <= max(most, 3))
+        return Polygon(next(fits, self._drawn[-1]))
+
+    def _next(self, points: Floats) -> Floats | None:
+        for fewer, added in _steps(points):
+            if Polygon(fewer).is_valid and (added.area <= LEAST_M2 or self._allowed.covers(added)):
+                return fewer
+        return None
 
 
 def _steps(points: Floats) -> Iterator[tuple[Floats, Polygon]]:

@@ -56,6 +56,9 @@ LOST_SHARE, LEFT_MIN, BARELY_SHARE = 0.9, 0.0002, 0.99
 LEFT_WORTH = 0.5
 # Of smaller fields, 1 ha with a swath of 6 m, lines are chosen from all that could be flown.
 SMALL_SWATHS2 = 300.0
+# Going through lines one by one saves less than that of a tour. So many of those chosen from all
+# that are worse in a row, by no more than that, tell that there are none better.
+WORSE, WORSE_MAX = 1.04, 2
 # Lines as long as each other and along each other.
 EQUAL_M, EQUAL_SINE = 1.0, 1e-3
 # The companion takes legs for one another within half a metre; ends of lines are moved a little.
@@ -116,8 +119,14 @@ class _Covering:
         )  # fmt: skip
         return self.tour(kept)
 
-    def selected(self, drawn: list[Floats], angles_deg: list[float]) -> Iterator[Tour]:
-        """Yield tours of lines that are chosen from all that could be flown, the best first."""
+    def selected(
+        self, drawn: list[Floats], angles_deg: list[float], *, best_s: float
+    ) -> Iterator[Tour]:
+        """Yield tours of lines that are chosen from all that could be flown, the best first.
+
+        Those that are clearly worse than one of value `best_s` are not gone through line by line,
+        and after some of them no others are looked at.
+        """
         ground, width_m, aim = self.field.spray, self.width_m, self.aim
         passes = border_passes(ground, width_m)
         best = drawn[0]
@@ -128,6 +137,7 @@ class _Covering:
         # Of each course: from the passes along the border on, and lines of the best layout.
         pools = [(joined([passes, family, best]), list(range(len(passes)))) for family in some]
         pools.append((joined([best, passes, *some, *drawn[1:]]), list(range(len(best)))))
+        worse = 0
         for lines in chosen(pools, ground, self.boom, motion=self.motion, aim=aim):
             if aim.covers_first:
                 more = patches(
@@ -135,8 +145,14 @@ class _Covering:
                     covered=self.boom.united(lines),
                 )  # fmt: skip
                 lines = joined([lines, more])
-            if len(lines):
-                yield self.worthwhile(self.tour(lines))
+            if not len(lines):
+                continue
+            tour = self.tour(lines)
+            worse = worse + 1 if self.value_s(tour) > WORSE * best_s else 0
+            if worse >= WORSE_MAX:
+                return
+            if not worse:
+                yield self.worthwhile(tour)
 
 
 def shadowed(lines: Floats) -> Bools:
@@ -208,7 +224,7 @@ def spray_lines(field: Field, settings: Settings, motion: Motion) -> tuple[Float
         found = min(
             (
                 other
-                for other in covering.selected(layouts, angles)
+                for other in covering.selected(layouts, angles, best_s=covering.value_s(tour))
                 if not covering.aim.covers_first or covering.left_m2(other) <= most_m2
             ),
             key=covering.value_s,

@@ -17,7 +17,7 @@ from companion.core.frame import LocalFrame
 from missions.boom import Boom, boom_of, over_warnings
 from missions.corners import Motion
 from missions.coverage import measure, narrow_patches, narrow_warnings, of_rated_ground
-from missions.demand import M2_PER_HA, Demand, Rates, demands, valve_places
+from missions.demand import M2_PER_HA, Demand, Rates, Uniform, demands, valve_places
 from missions.depots import DEPOTS_MAX, DepotChoice
 from missions.errors import OutOfReachError, PlanError
 from missions.field import Field, local_points
@@ -45,7 +45,6 @@ from missions.strips import (
     joined,
     lengths_m,
     no_lines,
-    whole,
 )
 from missions.surroundings import NOTHING_AROUND, Pacing, Surroundings
 from missions.ways import Ways, build_ways, edge_places, far_warnings
@@ -380,10 +379,8 @@ def _litres(line: Floats, treated: Objects, rates: Rates, boom: _Closing) -> tup
     aside_m = ((np.arange(ACROSS) + 0.5) / ACROSS - 0.5) * boom.places[:, 1:]
     is_done = _is_near(treated, line[:2], along, along_m, middle_m + aside_m)
     if is_done.any():
-        ground = whole(treated)
-        shapely.prepare(ground)
         points = places[:, None, None] + right * middle_m[..., None] + right * aside_m[..., None]
-        is_done[is_done] = shapely.contains_xy(ground, points[is_done])
+        is_done[is_done] = _are_in(treated, points[is_done])
     share = is_done.mean(axis=2).T
     middle = places + right * boom.places[:, :1, None]
     rate = rates.rates_at(middle[..., 0].ravel(), middle[..., 1].ravel()).reshape(share.shape)
@@ -395,6 +392,16 @@ def _litres(line: Floats, treated: Objects, rates: Rates, boom: _Closing) -> tup
     rate = np.where(share >= boom.closes_from - 1e-9, 0.0, rate)
     each_l = rate * boom.places[:, 1:] * length_m / count / M2_PER_HA
     return sum(each_l.sum(axis=1).tolist()), sum((each_l * share).sum(axis=1).tolist())
+
+
+def _are_in(strips: Objects, points: Floats) -> Bools:
+    """Return which points lie in any of some strips: putting these together takes far longer."""
+    shapely.prepare(strips)
+    found = np.zeros(len(points), dtype=np.bool_)
+    for strip in strips:
+        left = np.flatnonzero(~found)
+        found[left] = shapely.intersects_xy(strip, points[left])
+    return found
 
 
 def _is_near(
@@ -533,13 +540,16 @@ def line_pace(lines: Floats, rates: Rates, settings: Settings) -> Floats:
     """Return the time of a metre of each line, at the speeds that its rates need."""
     if settings.flow_l_min is None:
         return np.full(len(lines), 1.0 / settings.speed_m_s)
-    found = []
-    for row in lines.tolist():
-        leg = Leg(
-            kind="spray", points=((row[0], row[1]), (row[2], row[3])),
-            speed_m_s=settings.speed_m_s,
-        )  # fmt: skip
-        parts = stretches_of(leg, rates, settings)
-        taken = chosen(parts, choices(parts, settings), settings.acceleration_m_s2)
-        found.append(float(np.sum(np.diff(parts.ends_m, prepend=0.0) / taken)) / leg.length_m)
-    return np.array(found)
+    if isinstance(rates, Uniform):
+        # All lines are flown at one speed.
+        return np.full(len(lines), _pace_s_m(lines[0].tolist(), rates, settings))
+    return np.array([_pace_s_m(row, rates, settings) for row in lines.tolist()])
+
+
+def _pace_s_m(row: list[float], rates: Rates, settings: Settings) -> float:
+    leg = Leg(
+        kind="spray", points=((row[0], row[1]), (row[2], row[3])), speed_m_s=settings.speed_m_s
+    )
+    parts = stretches_of(leg, rates, settings)
+    taken = chosen(parts, choices(parts, settings), settings.acceleration_m_s2)
+    return float(np.sum(np.diff(parts.ends_m, prepend=0.0) / taken)) / leg.length_m

@@ -134,6 +134,9 @@ def chosen(found: Stretches, speeds: Floats, acceleration_m_s2: float) -> Floats
     outside = np.maximum(np.maximum(over, under), 0.0)
     beyond = np.where(outside > 1e-6, OUTSIDE_S_M + FARTHER_S_M * outside, 0.0)
     cost = length_m * (1.0 / speeds + beyond)
+    if len(cost) == 1:
+        alone: Floats = speeds[cost.argmin(axis=1)]
+        return alone
     step = speeds[None, :] - speeds[:, None]
     change = np.where(step == 0.0, 0.0, CHANGE_S + step**2 / (2.0 * acceleration_m_s2 * speeds))
     best, came_from = cost[0], []

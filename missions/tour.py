@@ -9,13 +9,14 @@ that touched is improved again (Martin, Otto and Felten 1991). Only what is no l
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import chain, pairwise
 
 import numpy as np
 
-from missions.network import Network, rows_of
+from missions.network import Ints, Network, rows_of
 from missions.searching import steps
+from missions.strips import Bools
 
 NEAREST = 12
 # Parts that a kick exchanges have so many pieces at most.
@@ -239,7 +240,9 @@ def by_savings(
     sorties: dict[int, Sortie] = {piece: [2 * piece] for piece in range(len(litres))}
     load = dict(enumerate(litres))
     sortie_of = list(range(len(litres)))
-    for one, other in _best_first(network, every_pair_max):
+    # Ends between two pieces of a sortie are joined to no other: most pairs have such an end.
+    is_outer = np.ones(network.depot, dtype=np.bool_)
+    for one, other in _pairs(network, every_pair_max, is_outer):
         first, second = sortie_of[one >> 1], sortie_of[other >> 1]
         if len(sorties) == 1:
             break
@@ -254,9 +257,23 @@ def by_savings(
             continue
         sorties[first] = whole
         load[first] += load.pop(second)
+        is_outer[[one, other]] = False
         for enter in sorties.pop(second):
             sortie_of[enter >> 1] = first
     return list(sorties.values())
+
+
+# So many pairs at once are looked at for ends that are still outer ones.
+PAIRS = 1024
+
+
+def _pairs(network: Network, every_pair_max: int, is_outer: Bools) -> Iterator[tuple[int, int]]:
+    """Yield the pairs of `_best_first`, without most of those that have no two outer ends."""
+    rows, columns = _best_first(network, every_pair_max)
+    for first in range(0, len(rows), PAIRS):
+        some = slice(first, first + PAIRS)
+        left = is_outer[rows[some]] & is_outer[columns[some]]
+        yield from zip(rows[some][left].tolist(), columns[some][left].tolist(), strict=True)
 
 
 def one_chain(network: Network, sorties: list[Sortie]) -> Sortie:
@@ -275,7 +292,7 @@ def one_chain(network: Network, sorties: list[Sortie]) -> Sortie:
     return whole
 
 
-def _best_first(network: Network, every_pair_max: int) -> list[tuple[int, int]]:
+def _best_first(network: Network, every_pair_max: int) -> tuple[Ints, Ints]:
     """Return pairs of ends of different pieces, those that save most when joined first."""
     count = network.depot
     if count <= every_pair_max:
@@ -290,7 +307,7 @@ def _best_first(network: Network, every_pair_max: int) -> list[tuple[int, int]]:
     home, between = network.between_s[count], network.between_s
     saved = home[rows] + home[columns] - between[rows, columns]
     order = np.argsort(-saved, kind="stable")
-    return list(zip(rows[order].tolist(), columns[order].tolist(), strict=True))
+    return rows[order], columns[order]
 
 
 def _leaving(sortie: Sortie, end: int) -> Sortie | None:

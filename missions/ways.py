@@ -27,6 +27,8 @@ ON_EDGE_M = 0.05
 DEPOT_FAR_M = 20_000.0
 # Of so many ends at once ways around corners are looked at: the tables on the way stay small.
 ENDS_TOGETHER = 512
+# For each of them so many corners at first, then twice as many, up to so many at once.
+CORNERS_FIRST, CORNERS_MOST = 4, 32
 # A depot farther from the field than this is worth a word: each flight is mostly ferry.
 DEPOT_FERRY_M = 500.0
 
@@ -164,13 +166,18 @@ def _over_corners_m(to_corner_m: Floats, ends: Floats, space: FreeSpace) -> Floa
     order = np.argsort(ways_m, axis=1, kind="stable")
     found = np.full(len(ends), np.inf)
     waiting = np.arange(len(ends))
-    # The first corner in sight is the best one: few are looked at.
-    for corner in order.T:
-        seen = space.sees(ends[waiting], space.corners[corner[waiting]])
-        found[waiting[seen]] = ways_m[waiting[seen], corner[waiting[seen]]]
-        waiting = waiting[~seen]
-        if not len(waiting):
-            break
+    # The first corner in sight is the best one: few are looked at, at first.
+    first, many = 0, CORNERS_FIRST
+    while len(waiting) and first < order.shape[1]:
+        corner = order[waiting, first : first + many]
+        count = corner.shape[1]
+        seen = space.sees(np.repeat(ends[waiting], count, axis=0), space.corners[corner.ravel()])
+        seen = seen.reshape(corner.shape)
+        is_seen, at = seen.any(axis=1), seen.argmax(axis=1)
+        some = waiting[is_seen]
+        found[some] = ways_m[some, corner[is_seen, at[is_seen]]]
+        waiting = waiting[~is_seen]
+        first, many = first + many, min(2 * many, CORNERS_MOST)
     return found
 
 

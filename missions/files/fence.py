@@ -23,7 +23,12 @@ from shapely.geometry.polygon import orient
 
 from companion.wording import counted
 from missions.errors import FenceError, PlanError
-from missions.fewer_corners import around_with_fewer_corners, each_inside, with_corners
+from missions.fewer_corners import (
+    FewerAndFewer,
+    around_with_fewer_corners,
+    each_inside,
+    with_corners,
+)
 from missions.field import Field
 from missions.files.items import FENCE_CORNERS_MAX, NAMES
 from missions.maps.local import polygons_of
@@ -165,9 +170,9 @@ class Fences:
     drawn: dict[Way, Fence] = field(default_factory=dict, repr=False)
     lacking: set[Way] = field(default_factory=set, repr=False)
     _simpler: dict[tuple[int, float], Shape] = field(default_factory=dict, repr=False)
-    _fewer: dict[tuple[Polygon, BaseGeometry, int], tuple[Polygon, float]] = field(
-        default_factory=dict, repr=False
-    )
+    _fewer: dict[
+        tuple[Polygon, BaseGeometry, float], tuple[FewerAndFewer, dict[int, tuple[Polygon, float]]]
+    ] = field(default_factory=dict, repr=False)
 
     @property
     def room_bytes(self) -> int:
@@ -327,12 +332,15 @@ class Fences:
 
         Most sorties share it.
         """
-        key = (fence.border, whole, most)
+        key = (fence.border, whole, fence.outside_m)
         if key not in self._fewer:
             allowed = whole.buffer(max(NEAR_M, fence.outside_m) - ROUNDED_M)
-            border = with_corners(fence.border, allowed, most)
-            self._fewer[key] = border, _outside_m(border, whole)
-        return self._fewer[key]
+            self._fewer[key] = FewerAndFewer(fence.border, allowed), {}
+        drawn, known = self._fewer[key]
+        if most not in known:
+            border = drawn.with_corners(most)
+            known[most] = border, _outside_m(border, whole)
+        return known[most]
 
     def _simpler_obstacles(self, shapes: Sequence[Shape], simpler_m: float) -> list[Shape]:
         """Return obstacles with fewer corners, within themselves; most of their ground stays."""

@@ -22,6 +22,7 @@ from companion.errors import MapError
 from missions.demand import Uniform
 from missions.errors import PlanError
 from missions.fewer_corners import (
+    FewerAndFewer,
     around_with_fewer_corners,
     each_inside,
     inside_with_fewer_corners,
@@ -38,7 +39,7 @@ from missions.plan import Plan, Settings
 from missions.planner import plan_mission
 from missions.reading_outline import outline_of
 from missions.strips import Floats
-from missions.ways import edge_places
+from missions.ways import build_ways, edge_places
 from tests.bench.missions import FRAME, to_degrees
 from tests.bench.parcels import parcel
 from tests.mission_fields import blob, degrees, recorded, trees
@@ -430,6 +431,9 @@ def test_a_border_with_fewer_corners_holds_all_of_it_on_allowed_ground(
     if far_m > 0.0 and corners(found) - 1 > max(most, 3):
         again = with_corners(found, area.buffer(far_m), most)
         assert corners(again) == corners(found)
+    drawn_once = FewerAndFewer(area, area.buffer(far_m))
+    for some in (most + 7, most, most + 3):
+        assert drawn_once.with_corners(some).equals(with_corners(area, area.buffer(far_m), some))
 
 
 def test_ways_among_many_obstacles_are_the_shortest() -> None:
@@ -446,6 +450,44 @@ def test_ways_among_many_obstacles_are_the_shortest() -> None:
     far = space.way((-5.0, -5.0), (250.0, 243.0))
     assert space.space.covers(shapely.LineString(far))
     assert shapely.LineString(far).length < 1.05 * math.dist((-5.0, -5.0), (250.0, 243.0))
+
+
+def test_many_ways_at_once_are_what_each_is_alone() -> None:
+    stones = shapely.union_all(
+        [box(20 * x + 3 * y, 20 * y, 20 * x + 3 * y + 9, 20 * y + 8)
+         for x in range(12) for y in range(12)]
+    )  # fmt: skip
+    space = free_space(rotate(box(-10, -10, 290, 260).difference(stones), 20.0))
+    places = np.random.default_rng(1).uniform(-80.0, 380.0, (400, 2))
+    starts, ends = places[:200].repeat(5, axis=0), places[200:].repeat(5, axis=0)[::-1]
+    seen = space.sees(starts, ends)
+    each = [space.sees(starts[[at]], ends[[at]])[0] for at in range(len(starts))]
+    assert seen.tolist() == each
+    assert 10 < seen.sum() < 500
+
+
+def test_ways_home_are_the_shortest_over_a_corner_in_sight() -> None:
+    stones = [to_degrees(box(x, 40.0 * (x % 50 > 0), x + 12.0, 40.0 * (x % 50 > 0) + 60.0))
+              for x in range(25, 300, 25)]  # fmt: skip
+    field = build_field(
+        to_degrees(box(0.0, 0.0, 320.0, 100.0)), obstacles=stones, obstacle_buffer_m=0.0,
+        swath_width_m=6.0, frame=FRAME,
+    )  # fmt: skip
+    ways = build_ways(field, np.array([[0.0, 50.0], [320.0, 90.0]]))
+    ends = np.random.default_rng(2).uniform((1.0, 1.0), (319.0, 99.0), (300, 2))
+    ends = ends[shapely.contains_xy(field.fly, ends)]
+    found_m = ways.home_ways_m(ends)
+    space = ways.inside
+    to_ends_m, from_gates_m = (
+        space.to_corners_m(each, nearest=None) for each in (ends, ways.gates)
+    )
+    for depot, gate in enumerate(ways.gates):
+        over_m = np.min(from_gates_m[depot][:, None] + space.between_m, axis=0) + to_ends_m
+        straight_m = np.hypot(*(ends - gate).T)
+        is_seen = space.sees(np.tile(gate, (len(ends), 1)), ends)
+        assert not is_seen.all()
+        shortest_m = np.where(is_seen, straight_m, over_m.min(axis=1))
+        assert np.allclose(found_m[depot], shortest_m, atol=1e-6)
 
 
 def test_a_low_tree_is_flown_across_without_a_stop_and_a_high_one_around() -> None:
