@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import shapely
 
@@ -17,6 +17,8 @@ from companion.core.frame import LocalFrame
 from companion.core.nozzle import SET_UP_FRACTION, rate_for_flow, set_change_l_min
 from companion.errors import ConfigError
 from companion.map_formats import geojson_feature, geojson_text
+from missions.files.items import Autopilot, Item
+from missions.files.write import plan_content, plan_json, rows_text
 from missions.maps.compiling import compiled_setup
 from sitl.stub.mission_items import PLACES, MissionItem, landing, speed, waypoint
 from sitl.stub.protocol import dialect
@@ -152,11 +154,10 @@ def write_calibration(
     _write(prescription, _map_text(layout, turned))
     _write(copy, _with_map(config.source_text, prescription.name))
     items = _items(layout, turned)
-    if out.suffix == ".plan":
-        text = json.dumps(plan(items), indent=1)
-    else:
-        text = "\n".join(waypoint_lines(items))
-    _write(out, f"{text}\n")
+    autopilot = config.mission.autopilot if config.mission else "ardupilot"
+    _write(
+        out, plan_of(items, autopilot=autopilot) if out.suffix == ".plan" else waypoints_of(items)
+    )
     compiled_setup(load(copy))  # refuses what could not be flown, such as a product's label
     return Written(mission=out, prescription=prescription, config=copy, layout=layout)
 
@@ -272,84 +273,46 @@ def _write(path: Path, text: str) -> None:
         raise ConfigError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
-# Mission files for simulated flights: QGC WPL 110 and QGroundControl's plan.
-#
-# What `stub/mission_items.py` reads; home comes first, as ArduPilot numbers it.
+# Mission files for simulated flights, of what `stub/mission_items.py` flies; home comes first.
 
-CRUISE_M_S, HOVER_M_S = 5.0, 5.0
-ARDUPILOT, COPTER = 3, 2  # MAV_AUTOPILOT_ARDUPILOTMEGA, MAV_TYPE_QUADROTOR
 OPEN_YAW = (dialect.MAV_CMD_NAV_WAYPOINT, dialect.MAV_CMD_NAV_TAKEOFF, dialect.MAV_CMD_NAV_LAND)
-ABSOLUTE = 0  # MAV_FRAME_GLOBAL: the frame of home
+# What QGroundControl takes for legs without a speed of their own.
+HOVER_M_S = 5.0
 
 
-def place_of(item: MissionItem) -> tuple[float, float]:
-    """Return latitude and longitude as files have them; 0 for an item without a place."""
-    if item.command not in PLACES:
-        return 0.0, 0.0
-    return round(item.latitude_deg, 7), round(item.longitude_deg, 7)
+def plan_of(items: Sequence[MissionItem], *, autopilot: Autopilot = "ardupilot") -> str:
+    """Return QGroundControl's plan."""
+    home, *own = items
+    content = plan_content(
+        [_item(one) for one in own],
+        home=(home.latitude_deg, home.longitude_deg),
+        autopilot=autopilot,
+        speed_m_s=HOVER_M_S,
+    )
+    return plan_json(content)
 
 
-def waypoint_lines(items: tuple[MissionItem, ...]) -> list[str]:
-    """Return the lines of a QGC WPL 110 file."""
-    lines = ["QGC WPL 110"]
-    for number, item in enumerate(items):
-        latitude_deg, longitude_deg = place_of(item)
-        columns = [
-            number,
-            int(number == 0),
-            item.frame if number else ABSOLUTE,
-            item.command,
-            *(f"{value:g}" for value in (item.param1, item.param2, item.param3, item.param4)),
-            f"{latitude_deg:.7f}",
-            f"{longitude_deg:.7f}",
-            f"{item.z_m:g}",
-            item.autocontinue,
-        ]
-        lines.append("\t".join(str(column) for column in columns))
-    return lines
+def waypoints_of(items: Sequence[MissionItem]) -> str:
+    """Return QGC WPL 110."""
+    home, *own = items
+    return rows_text([_item(one) for one in own], home=(home.latitude_deg, home.longitude_deg))
 
 
-def plan(items: tuple[MissionItem, ...]) -> dict[str, Any]:
-    """Return the content of QGroundControl's plan."""
-    home = [*place_of(items[0]), items[0].z_m]
-    return {
-        "fileType": "Plan",
-        "geoFence": {"circles": [], "polygons": [], "version": 2},
-        "groundStation": "QGroundControl",
-        "mission": {
-            "cruiseSpeed": CRUISE_M_S,
-            "firmwareType": ARDUPILOT,
-            "globalPlanAltitudeMode": 1,
-            "hoverSpeed": HOVER_M_S,
-            "items": [_simple(number, item) for number, item in enumerate(items) if number],
-            "plannedHomePosition": home,
-            "vehicleType": COPTER,
-            "version": 2,
-        },
-        "rallyPoints": {"points": [], "version": 2},
-        "version": 1,
-    }
-
-
-def _simple(number: int, item: MissionItem) -> dict[str, Any]:
-    place = place_of(item)
-    heights = {"AMSLAltAboveTerrain": None, "Altitude": item.z_m, "AltitudeMode": 1}
+def _item(item: MissionItem) -> Item:
+    has_place = item.command in PLACES
     # A yaw of 0 is the north to PX4; null leaves it to the autopilot.
     yaw_deg = item.param4 if item.param4 or item.command not in OPEN_YAW else None
-    return {
-        **(heights if item.command in PLACES else {}),
-        "autoContinue": bool(item.autocontinue),
-        "command": item.command,
-        "doJumpId": number,
-        "frame": item.frame,
-        "params": [item.param1, item.param2, item.param3, yaw_deg, *place, item.z_m],
-        "type": "SimpleItem",
-    }
+    return Item(
+        command=item.command,
+        frame=item.frame,
+        params=(item.param1, item.param2, item.param3, yaw_deg),
+        latitude_deg=item.latitude_deg if has_place else 0.0,
+        longitude_deg=item.longitude_deg if has_place else 0.0,
+        altitude_m=item.z_m,
+    )
 
 
-def write_mission(items: tuple[MissionItem, ...], folder: Path) -> None:
+def write_mission(items: Sequence[MissionItem], folder: Path) -> None:
     """Write `mission.waypoints` and `mission.plan` into a folder."""
-    lines = "\n".join(waypoint_lines(items)) + "\n"
-    (folder / "mission.waypoints").write_text(lines, encoding="utf-8")
-    text = json.dumps(plan(items), indent=1) + "\n"
-    (folder / "mission.plan").write_text(text, encoding="utf-8")
+    (folder / "mission.waypoints").write_text(waypoints_of(items), encoding="utf-8")
+    (folder / "mission.plan").write_text(plan_of(items), encoding="utf-8")

@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal
 
 from missions.errors import PlanError
 from missions.heights import raised
@@ -228,12 +228,15 @@ def check_content(plan: Plan, sortie: Sortie, content: dict[str, Any]) -> None:
 
 # ---------------------------------------------------------------------------------------- the items
 
-WAYPOINT, RETURN_TO_LAUNCH, TAKEOFF, CHANGE_SPEED, SPRAYER = 16, 20, 22, 178, 216
+WAYPOINT, RETURN_TO_LAUNCH, LAND, TAKEOFF, CHANGE_SPEED, SPRAYER = 16, 20, 21, 22, 178, 216
 # MAV_FRAME_GLOBAL_RELATIVE_ALT: metres above home; MAV_FRAME_MISSION: no place at all.
 RELATIVE, NO_PLACE = 3, 2
 # MAV_FRAME_GLOBAL_TERRAIN_ALT: metres above the ground as the vehicle knows it; ArduPilot only.
 ABOVE_GROUND = 10
 GROUND_SPEED = 1.0
+
+
+Autopilot = Literal["ardupilot", "px4"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -250,7 +253,7 @@ class Item:
     @property
     def has_place(self) -> bool:
         """Return whether the item is somewhere."""
-        return self.command in (WAYPOINT, TAKEOFF)
+        return self.command in (WAYPOINT, LAND, TAKEOFF)
 
 
 def items_of(plan: Plan, sortie: Sortie, *, with_sprayer: bool = False) -> tuple[Item, ...]:

@@ -27,6 +27,7 @@ from missions.files.items import (
     ABOVE_GROUND,
     RELATIVE,
     WAYPOINT,
+    Autopilot,
     Item,
     check_content,
     check_items,
@@ -258,30 +259,51 @@ def plan_text(
 ) -> str:
     """Return the content of the file; `fences` are those of the plan, where they are at hand."""
     fence = (fences or Fences(plan)).of(sortie)
-    home = plan.frame.to_geographic(*plan.depots[sortie.depot])
     items = items_of(plan, sortie, with_sprayer=with_sprayer)
     check_items(plan, sortie, len(items))
-    content = {
+    content = plan_content(
+        items,
+        home=plan.frame.to_geographic(*plan.depots[sortie.depot]),
+        autopilot=plan.settings.autopilot,
+        speed_m_s=plan.settings.speed_m_s,
+        fence=fence_content(plan, fence),
+        rally=[plan.frame.to_geographic(*depot) for depot in plan.depots],
+    )
+    check_content(plan, sortie, content)
+    return plan_json(content)
+
+
+def plan_content(
+    items: Sequence[Item],
+    *,
+    home: tuple[float, float],
+    autopilot: Autopilot,
+    speed_m_s: float,
+    fence: dict[str, Any] | None = None,
+    rally: Sequence[tuple[float, float]] = (),
+) -> dict[str, Any]:
+    """Return the content of a file with these items; places are (latitude, longitude)."""
+    return {
         "fileType": "Plan",
-        "geoFence": fence_content(plan, fence),
+        "geoFence": fence or {"circles": [], "polygons": [], "version": 2},
         "groundStation": "vrspray",
         "mission": {
-            "cruiseSpeed": plan.settings.speed_m_s,
-            "firmwareType": FIRMWARES[plan.settings.autopilot],
+            "cruiseSpeed": speed_m_s,
+            "firmwareType": FIRMWARES[autopilot],
             "globalPlanAltitudeMode": _mode_of_all(items),
-            "hoverSpeed": plan.settings.speed_m_s,
+            "hoverSpeed": speed_m_s,
             "items": [_simple(number, item) for number, item in enumerate(items, start=1)],
             "plannedHomePosition": [*_rounded(home), 0.0],
             "vehicleType": COPTER,
             "version": 2,
         },
-        "rallyPoints": {
-            "points": [[*_rounded(plan.frame.to_geographic(*depot)), 0.0] for depot in plan.depots],
-            "version": 2,
-        },
+        "rallyPoints": {"points": [[*_rounded(place), 0.0] for place in rally], "version": 2},
         "version": 1,
     }
-    check_content(plan, sortie, content)
+
+
+def plan_json(content: dict[str, Any]) -> str:
+    """Return the content as the text of the file."""
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 
@@ -320,20 +342,24 @@ ABSOLUTE = 0  # MAV_FRAME_GLOBAL: the frame of home
 
 
 def waypoints_text(plan: Plan, sortie: Sortie, *, with_sprayer: bool = False) -> str:
-    """Return the content of the file; there is no NaN in it: readers stumble over the word."""
-    latitude_deg, longitude_deg = plan.frame.to_geographic(*plan.depots[sortie.depot])
-    home = Item(
+    """Return the content of the file."""
+    items = items_of(plan, sortie, with_sprayer=with_sprayer)
+    check_items(plan, sortie, len(items))
+    return rows_text(items, home=plan.frame.to_geographic(*plan.depots[sortie.depot]))
+
+
+def rows_text(items: Sequence[Item], *, home: tuple[float, float]) -> str:
+    """Return items as a file; there is no NaN in it: readers stumble over the word."""
+    latitude_deg, longitude_deg = home
+    first = Item(
         command=WAYPOINT,
         frame=RELATIVE,
         params=(0.0, 0.0, 0.0, 0.0),
         latitude_deg=latitude_deg,
         longitude_deg=longitude_deg,
     )
-    own = items_of(plan, sortie, with_sprayer=with_sprayer)
-    check_items(plan, sortie, len(own))
-    items = (home, *own)
-    lines = ["QGC WPL 110", *(_row(number, item) for number, item in enumerate(items))]
-    return "\n".join(lines) + "\n"
+    rows = (_row(number, item) for number, item in enumerate((first, *items)))
+    return "\n".join(["QGC WPL 110", *rows]) + "\n"
 
 
 def _row(number: int, item: Item) -> str:
