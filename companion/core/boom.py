@@ -67,6 +67,10 @@ class Boom:
     forward_m: Floats = field(init=False, repr=False, compare=False)
     half_width_m: Floats = field(init=False, repr=False, compare=False)
     reach_m: float = field(init=False, repr=False, compare=False)
+    # Right, forward and half width of each strip in plain numbers: for few they are quicker.
+    strips_m: tuple[tuple[float, float, float], ...] = field(init=False, repr=False, compare=False)
+    # How far the farther tip is from the middle.
+    tip_m: float = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not 0.0 < self.width_m < 1000.0:
@@ -81,6 +85,11 @@ class Boom:
             object.__setattr__(self, name, np.array(values, dtype=np.float64))
         far = np.hypot(np.abs(self.right_m) + self.half_width_m, self.forward_m)
         object.__setattr__(self, "reach_m", float(far.max()))
+        each = (self.right_m, self.forward_m, self.half_width_m)
+        strips = zip(*(values.tolist() for values in each), strict=True)
+        object.__setattr__(self, "strips_m", tuple(strips))
+        tips = np.abs(self.right_m) + self.half_width_m
+        object.__setattr__(self, "tip_m", float(tips.max()))
 
 
 def body_axes(heading_deg: float) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -162,16 +171,18 @@ def straight_pass(state: VehicleState, boom: Boom, *, back_s: float, ahead_s: fl
     if motions is None or len(motions) != 2:
         return None
     (begin_s, *_, e0, n0), (end_s, *_, e1, n1) = motions
-    right, offsets = _offsets(state.heading_deg, boom.right_m, boom.forward_m)
+    angle = math.radians(state.heading_deg or 0.0)
+    sin, cos = math.sin(angle), math.cos(angle)
     points = []
-    for east, north in offsets:
+    for right, forward, _ in boom.strips_m:
+        east, north = right * cos + forward * sin, forward * cos - right * sin
         px, py = east + e0, north + n0
         dx, dy = (east + e1) - px, (north + n1) - py
         # The length as numpy has it, by the C library; `math.hypot` rounds otherwise.
         points.append((px, py, dx, dy, abs(complex(dx, dy)), dx * py - dy * px))
     times_s = (state.time_s + begin_s, state.time_s + end_s)
     speeds_m_s = (math.hypot(*motions[0][1:3]), math.hypot(*motions[1][1:3]))
-    return Pass(times_s, speeds_m_s, ((e0, n0), (e1, n1)), right, points)
+    return Pass(times_s, speeds_m_s, ((e0, n0), (e1, n1)), (cos, -sin), points)
 
 
 def predict(
@@ -198,7 +209,7 @@ def predict(
     else:
         knots = [motion[0] for motion in motions]
         middle = [(motion[3], motion[4]) for motion in motions]
-        aside = np.array(_offsets(heading_deg, right_m, forward_m)[1])
+        aside = np.array(_offsets(heading_deg, right_m, forward_m))
         east = aside[:, :1] + np.array([place[0] for place in middle])
         north = aside[:, 1:] + np.array([place[1] for place in middle])
         pace = np.empty(east.shape)
@@ -345,13 +356,11 @@ def _motions(state: VehicleState, back_s: float, ahead_s: float) -> list[_Motion
     return [(dt_s, *_carried(state, dt_s, ae, an)) for dt_s in ends_s]
 
 
-def _offsets(
-    heading_deg: float | None, right_m: Floats, forward_m: Floats
-) -> tuple[tuple[float, float], list[tuple[float, float]]]:
-    """Return the boom's right, and how far east and north each point is of the reference."""
-    angle = math.radians(heading_deg or 0.0)
+def _offsets(heading_deg: float, right_m: Floats, forward_m: Floats) -> list[tuple[float, float]]:
+    """Return how far east and north each point is of the reference."""
+    angle = math.radians(heading_deg)
     sin, cos = math.sin(angle), math.cos(angle)
-    return (cos, -sin), [
+    return [
         (right * cos + forward * sin, forward * cos - right * sin)
         for right, forward in zip(right_m.tolist(), forward_m.tolist(), strict=True)
     ]

@@ -8,7 +8,7 @@ duty (`_orders`), and the plan that they make.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
@@ -53,6 +53,7 @@ from companion.core.schedule import (
     STICKY_S,
     Dosing,
     ValveSchedule,
+    has_passed,
     in_zone,
     schedule,
     sticky_border_s,
@@ -111,10 +112,11 @@ class Memory:
 
 
 class Orders(NamedTuple):
-    """The schedule of each valve, and by which set, speed, skew and gain it was made."""
+    """The schedule of each valve, and by which set, duty, speed, skew and gain it was made."""
 
     valves: list[ValveSchedule]
     ordering: Ordering
+    in_force: tuple[float, ...]
     speed_m_s: float
     skew: float
     gain: float
@@ -141,16 +143,12 @@ def step(
     sequence = 1 if before is None else before.sequence + 1
     if permission.reasons or state is None:
         return _closed(setup, state, permission, watched, ordering.trim, sequence, now_s)
-    in_force = _in_force(setup, before, now_s)
     routes = _routes(setup, state, memory.routes, watched.area, now_s)
-    orders = _orders(
-        setup, state, routes.routes, ordering, liquid,
-        nozzle_sets=_nozzles(setup, watched), in_force=in_force, ran_s=watched.ran_s, now_s=now_s,
-    )  # fmt: skip
+    orders = _orders(setup, state, routes.routes, ordering, watched, before, now_s)
     plan = SprayPlan(
         sequence=sequence,
         issued_s=now_s,
-        duty=in_force,
+        duty=orders.in_force,
         changes=_in_order(orders.valves),
         lease_until_s=now_s + setup.lease_s,
     )
@@ -340,15 +338,13 @@ def _orders(
     state: VehicleState,
     routes: tuple[Route, ...],
     before: Ordering,
-    liquid: SprayPlan | None,
-    *,
-    nozzle_sets: tuple[NozzleSet, ...],
-    in_force: tuple[float, ...],
-    ran_s: float,
+    watched: Watched,
+    plan: SprayPlan | None,
     now_s: float,
 ) -> Orders:
-    """Return the changes of each valve along its route; `liquid` is what the meter's flow is of."""
+    """Return the changes of each valve along its route, after what the last plan has done."""
     speed_m_s = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
+    in_force = _in_force(setup, plan, now_s)
     # The middle of the boom decides on the set.
     index, set_of_rate = sets_ahead(
         setup.nozzle_sets,
@@ -358,47 +354,75 @@ def _orders(
         flow_of=_flow_of(setup, state, speed_m_s),
         now_s=state.time_s,
     )
-    trim = _trim(setup, state, before, liquid, now_s)
+    # What the meter's flow is of.
+    trim = _trim(setup, state, before, liquid_of(setup.pumping, plan), now_s)
     skew = skew_of(state, speed_m_s)
 
     def dose(number: int, share: float) -> Dosing:
         own = share if trim is None else share * trim.sets[number].trim
         return dosing_of(setup, number, skew / own, state.rate_percent)
 
-    dosing = dosing_by_valve(nozzle_sets, index, set_of_rate, dose)
+    dosing: Sequence[Dosing] = (on_off,) * len(in_force)
+    is_early, own_routes = False, routes
+    if setup.pumping is None:
+        sets = _nozzles(setup, watched)
+        dosing = dosing_by_valve(sets, index, set_of_rate, dose, count=len(in_force))
+    else:
+        own_routes, is_early = sections(
+            setup.pumping, routes, ran_s=watched.ran_s, was_early=before.is_early, now_s=now_s
+        )
+    own_routes, shares = _in_turn(setup, state, own_routes, in_force, now_s)
+    each = zip(own_routes, shares, in_force, dosing, strict=True)
+    valves = _scheduled(setup, state, list(each), index, speed_m_s, now_s)
+    gain = 1.0 if trim is None else trim.sets[index].trim
+    ordering = Ordering(index, set_of_rate, trim, is_early)
+    return Orders(valves, ordering, in_force, speed_m_s, skew, gain)
+
+
+# Of a valve: its route, its speed beside the boom's, the duty in force, and how it is dosed.
+_Due = tuple[Route, float, float, Dosing]
+
+
+def _scheduled(
+    setup: Setup,
+    state: VehicleState,
+    due: list[_Due],
+    set_index: int,
+    speed_m_s: float,
+    now_s: float,
+) -> list[ValveSchedule]:
+    """Return the changes of each valve until the lease ends."""
     soon_m_s = speed_soon(setup, state, speed_m_s)
-    overdrive = overdrive_of(setup, index)
+    overdrive = overdrive_of(setup, set_index)
     sticky_s = sticky_border_s(setup.border_buffer_m, speed_m_s)
     until_s = now_s + setup.lease_s
     # A crossing after this is for no order of this step, nor does it hold one back.
     free_s = max(until_s, now_s + STICKY_S) + setup.longest_s
-    is_early, own_routes = False, routes
-    if setup.pumping is not None:
-        own_routes, is_early = sections(
-            setup.pumping, routes, ran_s=ran_s, was_early=before.is_early, now_s=now_s
-        )
-    own_routes, shares = _in_turn(setup, state, own_routes, in_force, now_s)
     valves: list[ValveSchedule] = []
-    alike: dict[tuple[float | None, float, float, Dosing], ValveSchedule] = {}
-    for valve, (route, own) in enumerate(zip(own_routes, shares, strict=True)):
-        of_valve = dosing(valve) if setup.pumping is None else on_off
+    alike: dict[tuple[float | None, float, float, Dosing, bool], ValveSchedule] = {}
+    for valve, (route, own, in_force, dosing) in enumerate(due):
         # Of several crossings a stay may be too short, which is counted.
-        if len(route) == 1 or (len(route) == 2 and route[1].at_s > free_s):
+        is_inside = len(route) == 1 or (len(route) == 2 and route[1].at_s > free_s)
+        has_entered = not is_inside and overdrive is None and has_passed(route, now_s)
+        if is_inside or has_entered:
             # Neighbours in the middle of one zone do the same.
-            key = (route[0].rate_l_ha, own, in_force[valve], of_valve)
-            made = (
-                alike[key].of(valve)
-                if key in alike
-                else in_zone(key[0], valve, of_valve, in_force[valve], soon_m_s * own, now_s)
-            )
-            alike[key] = made
+            rate = route[has_entered].rate_l_ha
+            key = (rate, own, in_force, dosing, has_entered)
+            made = alike.get(key)
+            if made is None:
+                made = in_zone(
+                    rate, valve, dosing, in_force, soon_m_s * own, now_s, has_entered=has_entered
+                )
+                alike[key] = made
+            else:
+                made = made.of(valve)
         else:
             made = schedule(
                 route,
                 valve=valve,
                 timing=setup.timings[valve],
-                dosing=of_valve,
-                in_force=in_force[valve],
+                dosing=dosing,
+                in_force=in_force,
                 speed_soon_m_s=soon_m_s * own,
                 now_s=now_s,
                 until_s=until_s,
@@ -406,8 +430,7 @@ def _orders(
                 sticky_border_s=sticky_s,
             )
         valves.append(made)
-    gain = 1.0 if trim is None else trim.sets[index].trim
-    return Orders(valves, Ordering(index, set_of_rate, trim, is_early), speed_m_s, skew, gain)
+    return valves
 
 
 def _in_turn(

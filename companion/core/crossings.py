@@ -151,7 +151,8 @@ def _cuts_of_pass(way: Pass, edges: list[PlainEdge]) -> list[list[_Cut]]:
             if START_NUDGE_M < s <= reach_m:
                 met[point].append((round(s * 1e6), a > b, s, who, 0, s / reach_m))
     for each in met:
-        each.sort()
+        if len(each) > 1:
+            each.sort()
     return met
 
 
@@ -253,14 +254,18 @@ def _routes_of_pass(
     def chord_of(_point: int, _chord: int) -> tuple[Sequence[float], Sequence[float]]:
         return every_chord
 
-    speeds = [way.speed_m_s] * len(way.points)
-    rates = _rates(prescription, chord_of, bases, cuts)
+    rates = _rates_of_pass(prescription, way, chord_of, bases, cuts)
     closed = _centres_outside(chord_of, bases, cuts)
     if border == "inside":
         edges = [edge for edge in edges if edge[4] == FIELD]
         add_contacts_of_pass(way, edges, boom, border_buffer_m, closed)
-    each = zip(rates, closed, speeds, strict=True)
-    return tuple([_combine(*one, way.time_s, border) for one in each])
+    each = zip(rates, closed, strict=True)
+    return tuple(
+        [
+            _combine(steps, shut, way.speed_m_s, way.time_s, border) if shut else tuple(steps)
+            for steps, shut in each
+        ]
+    )
 
 
 # A timeline: as a route without any closed ground, the first entry at the start of the path.
@@ -276,26 +281,63 @@ def _rates(
     """Return the rate along each point's path."""
     timelines = []
     for point, (base, cuts) in enumerate(zip(bases, found, strict=True)):
-        inside = set(base)
-        inside.discard(FIELD)
-        rate = prescription.rate_of(frozenset(inside))
+        zones = _NO_FIELD.union(base) - _ONLY_FIELD
         (start_s, _), (pace, _) = chord_of(point, 0)
-        steps = [Crossing(start_s, rate, False, pace)]
+        begun = [Crossing(start_s, prescription.rate_of(zones), False, pace)]
+        steps = _walked(prescription, chord_of, point, zones, begun, cuts) if cuts else begun
         timelines.append(steps)
-        zone_cuts = [cut for cut in cuts if cut[3] != FIELD] if cuts else cuts
-        for i, (_, enters, along_m, owner, chord, share) in enumerate(zone_cuts):
-            if enters:
-                inside.add(owner)
-            else:
-                inside.discard(owner)
-            if i + 1 < len(zone_cuts) and zone_cuts[i + 1][2] - along_m < SLIVER_M:
-                continue  # the next zone begins here: a gap this narrow is none
-            new = prescription.rate_of(frozenset(inside))
-            if new != rate:
-                at_s, speed = _at(chord_of(point, chord), share)
-                steps.append(Crossing(at_s, new, False, speed))
-                rate = new
     return timelines
+
+
+_NO_FIELD, _ONLY_FIELD = frozenset[int](), frozenset({FIELD})
+
+
+def _rates_of_pass(
+    prescription: Prescription,
+    way: Pass,
+    chord_of: _ChordOf,
+    bases: Sequence[frozenset[int]],
+    found: list[list[_Cut]],
+) -> list[_Steps]:
+    """Return the rate along each point's path; points that begin in the same zones begin alike."""
+    timelines = []
+    alike: dict[frozenset[int], tuple[frozenset[int], _Steps]] = {}
+    for point, (base, cuts) in enumerate(zip(bases, found, strict=True)):
+        start = alike.get(base)
+        if start is None:
+            zones = base - _ONLY_FIELD
+            rate = prescription.rate_of(zones)
+            start = zones, [Crossing(way.time_s[0], rate, False, way.speed_m_s[0])]
+            alike[base] = start
+        steps = _walked(prescription, chord_of, point, *start, cuts) if cuts else start[1]
+        timelines.append(steps)
+    return timelines
+
+
+def _walked(
+    prescription: Prescription,
+    chord_of: _ChordOf,
+    point: int,
+    zones: frozenset[int],
+    begun: _Steps,
+    cuts: list[_Cut],
+) -> _Steps:
+    """Return the timeline of a point that begins in these zones and goes through the cuts."""
+    inside, rate, steps = set(zones), begun[0].rate_l_ha, begun.copy()
+    zone_cuts = [cut for cut in cuts if cut[3] != FIELD]
+    for i, (_, enters, along_m, owner, chord, share) in enumerate(zone_cuts):
+        if enters:
+            inside.add(owner)
+        else:
+            inside.discard(owner)
+        if i + 1 < len(zone_cuts) and zone_cuts[i + 1][2] - along_m < SLIVER_M:
+            continue  # the next zone begins here: a gap this narrow is none
+        new = prescription.rate_of(frozenset(inside))
+        if new != rate:
+            at_s, speed = _at(chord_of(point, chord), share)
+            steps.append(Crossing(at_s, new, False, speed))
+            rate = new
+    return steps
 
 
 def _starts(paths: Paths) -> tuple[Floats, Floats]:
@@ -385,7 +427,10 @@ def _centres_outside(
     for point, (base, cuts) in enumerate(zip(bases, found, strict=True)):
         intervals: Intervals = []
         closed.append(intervals)
-        inside, since_s = FIELD in base, chord_of(point, 0)[0][0]
+        inside = FIELD in base
+        if inside and not cuts:
+            continue
+        since_s = chord_of(point, 0)[0][0]
         for _, enters, _, owner, chord, share in cuts:
             if owner != FIELD or enters is inside:
                 continue

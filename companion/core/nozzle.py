@@ -10,7 +10,6 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import pairwise
 from typing import Protocol
 
@@ -345,16 +344,20 @@ def dosing_of(setup: Sprayer, index: int, skew: float, percent: float) -> Dosing
     over its share.
     """
     width_m = setup.boom.width_m * skew
-    curve, pwm = setup.nozzle_sets[index].curve, setup.pwm
+    duty_for, pwm, limit_l_ha = (
+        setup.nozzle_sets[index].curve.duty_for,
+        setup.pwm,
+        setup.rate_max_l_ha,
+    )
     known: dict[tuple[float, float], float] = {}  # neighbours ask for the same
 
     def duty(rate_l_ha: float, speed_m_s: float) -> float:
         key = (rate_l_ha, speed_m_s)
         found = known.get(key)
         if found is None:
-            asked = overridden(rate_l_ha, percent, setup.rate_max_l_ha)
+            asked = overridden(rate_l_ha, percent, limit_l_ha)
             flow = flow_for_rate(asked, speed_m_s, width_m)
-            found = known[key] = allowed_duty(curve.duty_for(flow), pwm)
+            found = known[key] = allowed_duty(duty_for(flow), pwm)
         return found
 
     return duty
@@ -459,7 +462,9 @@ def dosing_by_valve(
     in_use: int,
     of_rate: SetOfRate,
     dose: Callable[[int, float], Dosing],
-) -> Callable[[int], Dosing]:
+    *,
+    count: int,
+) -> list[Dosing]:
     """Return each valve's dosing: by the set of its rate, closed where that set lacks the valve.
 
     `dose` makes the dosing of a set and of a valve's share. A rate that only the sides of the boom
@@ -468,7 +473,9 @@ def dosing_by_valve(
     is_one = all(number == in_use for _, number in of_rate)
     if is_one and not sets[in_use].shares:
         members, one = sets[in_use].valves, dose(in_use, 1.0)
-        return lambda valve: one if valve in members else _shut
+        if len(members) == count:
+            return [one] * count
+        return [one if valve in members else _shut for valve in range(count)]
     chosen = dict(of_rate)
     known: dict[tuple[int, float], Dosing] = {}
 
@@ -481,7 +488,7 @@ def dosing_by_valve(
         return known[key]
 
     if is_one:
-        return partial(member, in_use)
+        return [member(in_use, valve) for valve in range(count)]
 
     def of_valve(valve: int) -> Dosing:
         def duty(rate_l_ha: float, speed_m_s: float) -> float:
@@ -489,7 +496,7 @@ def dosing_by_valve(
 
         return duty
 
-    return of_valve
+    return [of_valve(valve) for valve in range(count)]
 
 
 def _shut(rate_l_ha: float, speed_m_s: float) -> float:  # noqa: ARG001

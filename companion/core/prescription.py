@@ -8,7 +8,7 @@ number of zones. A map in rows and columns has its cells instead of zones (`cell
 
 from __future__ import annotations
 
-from collections.abc import Sequence, Set
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import compress
@@ -79,6 +79,8 @@ class Near(NamedTuple):
     parts: NDArray[np.object_]
     boxes: list[list[float]]
     owners: list[int]
+    # Those of them that were looked into, and whose they are: mostly the same as the step before.
+    chosen: dict[tuple[int, ...], tuple[NDArray[np.object_], list[int]]]
 
     def covers(self, box: Box) -> bool:
         """Return whether it has all that is near another box."""
@@ -97,13 +99,17 @@ class Near(NamedTuple):
     def owners_at(self, east_m: list[float], north_m: list[float]) -> list[frozenset[int]]:
         """Return as `Prescription.owners_at` does, for points that it covers."""
         west, south, east, north = min(east_m), min(north_m), max(east_m), max(north_m)
-        hit = [
-            i
-            for i, (w, s, e, n) in enumerate(self.boxes)
-            if w <= east and s <= north and e >= west and n >= south
-        ]
-        within = shapely.contains_xy(self.parts[hit], np.array(east_m), np.array(north_m)).tolist()
-        owners = [self.owners[i] for i in hit]
+        hit = tuple(
+            [
+                i
+                for i, (w, s, e, n) in enumerate(self.boxes)
+                if w <= east and s <= north and e >= west and n >= south
+            ]
+        )
+        if hit not in self.chosen:
+            self.chosen[hit] = self.parts[list(hit)], [self.owners[i] for i in hit]
+        parts, owners = self.chosen[hit]
+        within = shapely.contains_xy(parts, np.array(east_m), np.array(north_m)).tolist()
         inside = list(zip(*within, strict=True)) or [()] * len(east_m)
         of_each = {one: frozenset(compress(owners, one)) for one in set(inside)}
         return [of_each[one] for one in inside]
@@ -232,16 +238,17 @@ class Prescription:
                 self._parts[parts][:, None],
                 self._boxes[parts].tolist(),
                 self._owner[parts].tolist(),
+                {},
             )
         return found
 
     def owners_near(
         self, near: Near, east_m: list[float], north_m: list[float]
-    ) -> Sequence[Set[int]]:
+    ) -> list[frozenset[int]]:
         """Return as `owners_at` does, for points near what was looked up."""
         if self.cells is None:
             return near.owners_at(east_m, north_m)
-        return self.owners_at(np.array(east_m), np.array(north_m))
+        return list(map(frozenset, self.owners_at(np.array(east_m), np.array(north_m))))
 
     def rate_of(self, zones: frozenset[int]) -> float | None:
         """Return the rate where exactly these zones lie, by the overlap policy."""

@@ -224,13 +224,11 @@ class ValveSchedule(NamedTuple):
 
     def of(self, valve: int) -> ValveSchedule:
         """Return the same for another valve."""
-        if not self.changes:
+        changes, late, unresolved_count, rate = self
+        if not changes:
             return self
-        changes = [
-            TimedChange(at_s=each.at_s, valve=valve, duty=each.duty, restart=each.restart)
-            for each in self.changes
-        ]
-        return ValveSchedule(tuple(changes), *self[1:])
+        of_valve = tuple([each.of_valve(valve) for each in changes])
+        return ValveSchedule(of_valve, late, unresolved_count, rate)
 
 
 def resolve(route: Route, dwell_min_s: float) -> tuple[Route, int]:
@@ -241,8 +239,8 @@ def resolve(route: Route, dwell_min_s: float) -> tuple[Route, int]:
     an opening too short to be used is not made. Several short stays in a row may be one that is
     still too short, hence the repetition; each round that drops one has fewer crossings.
     """
-    if len(route) == 2 and not route[1].is_as(route[0]):  # nothing follows: no stay is short
-        return route, 0
+    if len(route) == 2 and route[1].rate_l_ha != route[0].rate_l_ha:
+        return route, 0  # nothing follows: no stay is short
     given_up = 0
     while True:
         route, dropped = _resolve_once(route, dwell_min_s)
@@ -412,9 +410,9 @@ def schedule(
     """
     if len(route) == 1:
         return in_zone(route[0].rate_l_ha, valve, dosing, in_force, speed_soon_m_s, now_s)
-    due = 0
     resolved, unresolved = resolve(route, timing.dwell_min_s)
     made = orders(resolved, timing, dosing, overdrive)
+    due = 0
     while due + 1 < len(made) and made[due + 1].at_s <= now_s:
         due += 1
     if due + 1 < len(made) and _already_ordered(
@@ -463,17 +461,34 @@ def in_zone(
     in_force: float,
     speed_m_s: float,
     now_s: float,
+    *,
+    has_entered: bool = False,
 ) -> ValveSchedule:
-    """Return what a valve does in the middle of a zone: a trim for the speed, or nothing."""
+    """Return what a valve does in the middle of a zone: a trim for the speed, or nothing.
+
+    Where it `has_entered` just now, more than a trim is its change of zone, and late.
+    """
     duty = 0.0 if rate_l_ha is None else dosing(rate_l_ha, speed_m_s)
     moves = abs(duty - in_force)
     if moves < DUTY_STEP and (duty == 0.0) == (in_force == 0.0):
         return ValveSchedule((), False, 0, rate_l_ha)
-    if not 0.0 < moves <= SPEED_MAX_SHARE * in_force or duty == 0.0:
+    share = TRIM_MAX_SHARE if has_entered else SPEED_MAX_SHARE
+    if not 0.0 < moves <= share * in_force or duty == 0.0:
         change = TimedChange(at_s=now_s, valve=valve, duty=duty)
-        return ValveSchedule((change,), False, 0, rate_l_ha)
+        return ValveSchedule((change,), has_entered, 0, rate_l_ha)
     trims = _trims(valve, in_force, duty, now_s, math.inf)
     return ValveSchedule(tuple(trims), False, 0, rate_l_ha)
+
+
+def has_passed(route: Route, now_s: float) -> bool:
+    """Return whether all that a route of one crossing has to say is the zone behind it.
+
+    Its change was due before the crossing, whatever the lag. What the border bounds may be later.
+    """
+    if len(route) != 2:
+        return False
+    (_, before, was_outside, _), (at_s, rate, outside, _) = route
+    return at_s <= now_s and rate != before and not (was_outside or outside)
 
 
 def sticky_border_s(border_buffer_m: float, speed_m_s: float) -> float:

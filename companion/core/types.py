@@ -83,7 +83,15 @@ class PwmLimits:
         return 1.0 / self.frequency_hz
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+def _wrong_in_change(at_s: float, valve: int, duty: float) -> str:
+    if not 0.0 <= duty <= 1.0:
+        return f"duty outside [0, 1]: {duty}"
+    if not abs(at_s) < math.inf:
+        return f"time of a change is not finite: {at_s}"
+    return f"valve index is negative: {valve}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, init=False)
 class TimedChange:
     """Valve number `valve` (index from the left) takes `duty` at `at_s`.
 
@@ -96,15 +104,28 @@ class TimedChange:
     duty: float
     restart: bool = True
 
-    def __post_init__(self) -> None:
-        if 0.0 <= self.duty <= 1.0 and -math.inf < self.at_s < math.inf and self.valve >= 0:
-            return  # at once: each step makes several
-        if not 0.0 <= self.duty <= 1.0:
-            raise ValueError(f"duty outside [0, 1]: {self.duty}")
-        if not abs(self.at_s) < math.inf:
-            raise ValueError(f"time of a change is not finite: {self.at_s}")
-        if not self.valve >= 0:
-            raise ValueError(f"valve index is negative: {self.valve}")
+    def __init__(self, *, at_s: float, valve: int, duty: float, restart: bool = True) -> None:
+        # Written out: each step makes several for every valve, and checks before it stores.
+        if not (0.0 <= duty <= 1.0 and -math.inf < at_s < math.inf and valve >= 0):
+            raise ValueError(_wrong_in_change(at_s, valve, duty))
+        put = object.__setattr__
+        put(self, "at_s", at_s)
+        put(self, "valve", valve)
+        put(self, "duty", duty)
+        put(self, "restart", restart)
+
+    def of_valve(self, valve: int) -> TimedChange:
+        """Return the same change of another valve: what was checked is not checked again.
+
+        In mid-zone each step makes two for every valve, and this takes less than half the time.
+        """
+        made = object.__new__(TimedChange)
+        put = object.__setattr__
+        put(made, "at_s", self.at_s)
+        put(made, "valve", valve)
+        put(made, "duty", self.duty)
+        put(made, "restart", self.restart)
+        return made
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,11 +11,14 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from companion.core.frame import Bools, Floats, Ints, Place
 
 # Number of a tile eastwards and northwards.
 TileKey = tuple[int, int]
+# Eight cells in each.
+Octets = NDArray[np.uint8]
 # Corners in turn, either way round.
 Quad = tuple[Place, Place, Place, Place]
 
@@ -24,6 +27,7 @@ Quad = tuple[Place, Place, Place, Place]
 CELL_M = 0.2
 TILE_CELLS = 64
 TILE_BYTES = TILE_CELLS * TILE_CELLS // 8
+_BARE = bytes(TILE_BYTES)
 # 655 ha, 20 MB: more than any tank; whatever makes more is no flight.
 TILES_MAX = 40_000
 # A swath of one second at 100 m/s with the widest boom; a larger one is a jump of the position.
@@ -62,7 +66,7 @@ class Coverage:
         One that crosses itself counts as the two
         triangles at its first corner. A cell is treated where its centre is.
         """
-        drafts: dict[TileKey, Bools] = {}
+        drafts: dict[TileKey, Octets] = {}
         for quad in quads:
             for first_row, first_column, inside in _insides(quad):
                 self._add(drafts, first_row, first_column, inside)
@@ -144,32 +148,43 @@ class Coverage:
         return found
 
     def _add(
-        self, drafts: dict[TileKey, Bools], first_row: int, first_column: int, inside: Bools
+        self, drafts: dict[TileKey, Octets], first_row: int, first_column: int, inside: Bools
     ) -> None:
-        """Set cells in the drafts of the tiles that they lie in."""
+        """Set cells in the drafts of the tiles that they lie in, eight at once."""
         size = TILE_CELLS
         row_count, column_count = inside.shape
+        # From the first column of a byte on, as the tiles have them.
+        shift = first_column % 8
+        wide = np.zeros((row_count, shift + column_count), dtype=np.bool_)
+        wide[:, shift:] = inside
+        octets = np.packbits(wide, axis=1)
+        first_octet, octet_count = (first_column - shift) // 8, octets.shape[1]
+        across = size // 8
         for y in range(first_row // size, (first_row + row_count - 1) // size + 1):
             low, high = max(first_row, y * size), min(first_row + row_count, (y + 1) * size)
-            of_rows = inside[low - first_row : high - first_row]
-            for x in range(first_column // size, (first_column + column_count - 1) // size + 1):
-                left = max(first_column, x * size)
-                right = min(first_column + column_count, (x + 1) * size)
-                part = of_rows[:, left - first_column : right - first_column]
-                if not part.any():
-                    continue
-                if (x, y) not in drafts:
-                    tile = self.tiles.get((x, y))
-                    drafts[x, y] = (
-                        np.zeros((size, size), dtype=np.bool_) if tile is None else _unpacked(tile)
-                    )
-                draft = drafts[x, y]
-                draft[low - y * size : high - y * size, left - x * size : right - x * size] |= part
+            of_rows = octets[low - first_row : high - first_row]
+            for x in range(first_octet // across, (first_octet + octet_count - 1) // across + 1):
+                left = max(first_octet, x * across)
+                right = min(first_octet + octet_count, (x + 1) * across)
+                part = of_rows[:, left - first_octet : right - first_octet]
+                draft = drafts.get((x, y))
+                if draft is None:
+                    if not part.any():
+                        continue
+                    draft = drafts[x, y] = np.array(self._octets(x, y))
+                draft[low - y * size : high - y * size, left - x * across : right - x * across] |= (
+                    part
+                )
 
-    def _with(self, drafts: dict[TileKey, Bools]) -> Coverage:
+    def _octets(self, x: int, y: int) -> Octets:
+        """Return a tile as rows of bytes."""
+        tile = self.tiles.get((x, y), _BARE)
+        return np.frombuffer(tile, dtype=np.uint8).reshape(TILE_CELLS, TILE_CELLS // 8)
+
+    def _with(self, drafts: dict[TileKey, Octets]) -> Coverage:
         tiles = dict(self.tiles)
         for key, draft in drafts.items():
-            packed = np.packbits(draft).tobytes()
+            packed = draft.tobytes()
             if tiles.get(key) == packed or (key not in tiles and len(tiles) >= TILES_MAX):
                 continue
             tiles[key] = packed
@@ -205,11 +220,17 @@ def _insides(quad: Quad) -> Iterator[tuple[int, int, Bools]]:
         if columns < 1 or rows < 1:
             continue
         x = (np.arange(columns) + (first_column + 0.5)) * CELL_M
-        y = ((np.arange(rows) + (first_row + 0.5)) * CELL_M)[:, None]
-        inside = np.ones((rows, columns), dtype=np.bool_)
+        y = (np.arange(rows) + (first_row + 0.5)) * CELL_M
+        # All sides at once: each call of numpy costs more than the cells that it looks at.
+        level, across, along = [], [], []
         for (x0, y0), (x1, y1) in zip(part, (*part[1:], part[0]), strict=True):
             dx, dy = x1 - x0, y1 - y0
-            inside &= dx * y + (TOUCH_M2 - dx * y0 + dy * x0) >= dy * x
+            level.append(TOUCH_M2 - dx * y0 + dy * x0)
+            across.append(dx)
+            along.append(dy)
+        sides = np.array([across, level, along])[:, :, None]
+        bound, reached = sides[0] * y + sides[1], sides[2] * x
+        inside = np.logical_and.reduce(bound[:, :, None] >= reached[:, None, :], axis=0)
         yield first_row, first_column, inside
 
 

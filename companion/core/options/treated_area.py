@@ -17,8 +17,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
-import numpy as np
-
 from companion.core.boom import Boom, turning_of
 from companion.core.frame import Offset, Place
 from companion.core.options.coverage import Coverage, Quad
@@ -63,20 +61,18 @@ def _stays(
     is_open: tuple[bool, ...], flow_edges: tuple[FlowEdge, ...], start_s: float, end_s: float
 ) -> list[_Stays]:
     """Return when each valve is open between two times."""
-    found: list[_Stays] = []
-    for valve, opens in enumerate(is_open):
-        stays = []
-        since_s = start_s
-        for flow_edge in flow_edges:
-            if flow_edge.valve != valve or flow_edge.at_s > end_s or flow_edge.opens is opens:
-                continue
-            if opens:
-                stays.append((since_s, flow_edge.at_s))
-            opens, since_s = flow_edge.opens, max(flow_edge.at_s, start_s)
+    now, since_s = list(is_open), [start_s] * len(is_open)
+    found: list[list[tuple[float, float]]] = [[] for _ in is_open]
+    for at_s, valve, opens in flow_edges:
+        if at_s > end_s or opens is now[valve]:
+            continue
+        if now[valve]:
+            found[valve].append((since_s[valve], at_s))
+        now[valve], since_s[valve] = opens, max(at_s, start_s)
+    for valve, opens in enumerate(now):
         if opens:
-            stays.append((since_s, end_s))
-        found.append(tuple(stay for stay in stays if stay[1] > stay[0]))
-    return found
+            found[valve].append((since_s[valve], end_s))
+    return [tuple([stay for stay in stays if stay[1] > stay[0]]) for stays in found]
 
 
 # Left and right end, place ahead, and when it is open: of valves side by side that are so together.
@@ -85,13 +81,7 @@ _Strip = tuple[float, float, float, _Stays]
 
 def _strips(boom: Boom, stays: list[_Stays]) -> list[_Strip]:
     found: list[_Strip] = []
-    for right_m, forward_m, half_m, own in zip(
-        boom.right_m.tolist(),
-        boom.forward_m.tolist(),
-        boom.half_width_m.tolist(),
-        stays,
-        strict=True,
-    ):
+    for (right_m, forward_m, half_m), own in zip(boom.strips_m, stays, strict=True):
         left_m = right_m - half_m
         if found and found[-1][2:] == (forward_m, own) and abs(found[-1][1] - left_m) <= TOUCH_M:
             left_m = found.pop()[0]
@@ -107,8 +97,7 @@ class _BoomPath:
 
     def __init__(self, boom: Boom, poses: tuple[BoomPose, ...]) -> None:
         self._fronts = poses
-        reach_m = float((np.abs(boom.right_m) + boom.half_width_m).max())
-        tips = []
+        reach_m, tips = boom.tip_m, []
         for _, east_m, north_m, heading_deg in poses:
             angle = math.radians(heading_deg)
             sin, cos = reach_m * math.sin(angle), reach_m * math.cos(angle)
@@ -324,7 +313,8 @@ class TreatedAreaSettings:
 
 def wake_m(boom: Boom) -> float:
     """Return on how much of the last way what is treated is this pass's own."""
-    spread_m = float(boom.forward_m.max() - boom.forward_m.min())
+    ahead_m = [forward_m for _, forward_m, _ in boom.strips_m]
+    spread_m = max(ahead_m) - min(ahead_m)
     return min(spread_m + WAKE_MARGIN_M, WAKE_MAX_M)
 
 
