@@ -67,9 +67,8 @@ class Boom:
     forward_m: Floats = field(init=False, repr=False, compare=False)
     half_width_m: Floats = field(init=False, repr=False, compare=False)
     reach_m: float = field(init=False, repr=False, compare=False)
-    # Right, forward and half width of each strip in plain numbers: for few they are quicker.
+    # Right, forward and half width of each in plain numbers; how far the farther tip is aside.
     strips_m: tuple[tuple[float, float, float], ...] = field(init=False, repr=False, compare=False)
-    # How far the farther tip is from the middle.
     tip_m: float = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -83,13 +82,12 @@ class Boom:
             ("half_width_m", [valve.width_m / 2 for valve in self.valves]),
         ):
             object.__setattr__(self, name, np.array(values, dtype=np.float64))
-        far = np.hypot(np.abs(self.right_m) + self.half_width_m, self.forward_m)
-        object.__setattr__(self, "reach_m", float(far.max()))
+        aside = np.abs(self.right_m) + self.half_width_m
+        object.__setattr__(self, "tip_m", float(aside.max()))
+        object.__setattr__(self, "reach_m", float(np.hypot(aside, self.forward_m).max()))
         each = (self.right_m, self.forward_m, self.half_width_m)
         strips = zip(*(values.tolist() for values in each), strict=True)
         object.__setattr__(self, "strips_m", tuple(strips))
-        tips = np.abs(self.right_m) + self.half_width_m
-        object.__setattr__(self, "tip_m", float(tips.max()))
 
 
 def body_axes(heading_deg: float) -> tuple[tuple[float, float], tuple[float, float]]:

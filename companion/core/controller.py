@@ -144,6 +144,7 @@ def step(
     if permission.reasons or state is None:
         return _closed(setup, state, permission, watched, ordering.trim, sequence, now_s)
     routes = _routes(setup, state, memory.routes, watched.area, now_s)
+    watched = _settled(watched, now_s, is_busy=routes.found_from is state)
     orders = _orders(setup, state, routes.routes, ordering, watched, before, now_s)
     plan = SprayPlan(
         sequence=sequence,
@@ -196,6 +197,14 @@ def _watch(
         report = None if state is None else state.flow
         track = valve_tracking.follow(setup.tracking, track, plan, report, now_s=now_s)
     return Watched(watch, area, ran_s, track)
+
+
+def _settled(watched: Watched, now_s: float, *, is_busy: bool) -> Watched:
+    """Return it with its ground stamped: by a step that had no routes to find, or before long."""
+    area = watched.area
+    if area is None or area.unstamped is None or (is_busy and area.may_wait(now_s)):
+        return watched
+    return watched._replace(area=area.settled())
 
 
 def _nozzles(setup: Setup, watched: Watched) -> tuple[NozzleSet, ...]:
@@ -347,13 +356,10 @@ def _orders(
     in_force = _in_force(setup, plan, now_s)
     # The middle of the boom decides on the set.
     index, set_of_rate = sets_ahead(
-        setup.nozzle_sets,
-        routes[len(routes) // 2],
-        in_use=before.set_index,
-        before=before.set_of_rate,
-        flow_of=_flow_of(setup, state, speed_m_s),
-        now_s=state.time_s,
-    )
+        setup.nozzle_sets, routes[len(routes) // 2],
+        in_use=before.set_index, before=before.set_of_rate,
+        flow_of=_flow_of(setup, state, speed_m_s), now_s=state.time_s,
+    )  # fmt: skip
     # What the meter's flow is of.
     trim = _trim(setup, state, before, liquid_of(setup.pumping, plan), now_s)
     skew = skew_of(state, speed_m_s)
@@ -418,17 +424,10 @@ def _scheduled(
                 made = made.of(valve)
         else:
             made = schedule(
-                route,
-                valve=valve,
-                timing=setup.timings[valve],
-                dosing=dosing,
-                in_force=in_force,
-                speed_soon_m_s=soon_m_s * own,
-                now_s=now_s,
-                until_s=until_s,
-                overdrive=overdrive,
-                sticky_border_s=sticky_s,
-            )
+                route, valve=valve, timing=setup.timings[valve], dosing=dosing,
+                in_force=in_force, speed_soon_m_s=soon_m_s * own, now_s=now_s, until_s=until_s,
+                overdrive=overdrive, sticky_border_s=sticky_s,
+            )  # fmt: skip
         valves.append(made)
     return valves
 
@@ -446,7 +445,8 @@ def _in_turn(
     swing about one end, nothing opens once more.
     """
     shares = speed_shares(state, setup.boom, acts_after_s(setup))
-    if all(own > 0.0 for own in shares):
+    # Mostly all of them go as the boom does.
+    if shares.count(1.0) == len(shares) or all(own > 0.0 for own in shares):
         return routes, shares
     swings = state.yaw_rate_deg_s * state.yaw_gain_deg_s2 > 0.0
     closed: Route = (Crossing(now_s, None, False, 0.0),)

@@ -138,6 +138,44 @@ def test_a_jump_of_the_position_leaves_nothing_between() -> None:
     assert not made.covered_at(np.arange(15.0, 300.0), np.full(285, 3.0)).any()
 
 
+def test_ground_that_waits_to_be_stamped_is_known_and_does_not_wait_long() -> None:
+    own, memory, waited = given(), Memory(), 0
+    for i in range(181):
+        now = 10.0 + i / 20.0
+        _, memory = step(own, flying(now, START_M + 0.25 * i), memory, now)
+        area = memory.watched.area
+        assert area is not None
+        if area.unstamped is None:
+            continue
+        waited += 1
+        until_s = area.older[-1].until_s
+        assert now - until_s < treated_area.UNSTAMPED_MAX_S
+        stamped = area.settled()
+        assert stamped.unstamped is None
+        assert stamped.raster == area.coverage == stamped.older[-1].coverage
+        assert stamped.raster != area.raster
+        # Whoever asks meanwhile is told of it.
+        state = flying(now + 1.0, START_M + 0.25 * i + 5.0)
+        here = (state.east_m, state.north_m)
+        assert area.before(now, here=here, behind_m=1.0) == stamped.raster
+    assert waited > 0
+
+
+def test_in_a_turn_where_no_step_has_time_the_ground_is_stamped_all_the_same() -> None:
+    own, memory, waits = given(), Memory(), []
+    for i in range(100):
+        now = 10.0 + i / 20.0
+        state = flying(now, 1.0 + 0.25 * i, yaw_rate_deg_s=10.0)
+        _, memory = step(own, state, memory, now)
+        area = memory.watched.area
+        assert area is not None
+        if area.unstamped is not None:
+            waits.append(now - area.older[-1].until_s)
+    longest_s = treated_area.UNSTAMPED_MAX_S
+    assert longest_s - 0.051 < max(waits) < longest_s
+    assert area.raster.tiles
+
+
 # ------------------------------------------------------------------------------ of the liquid
 
 

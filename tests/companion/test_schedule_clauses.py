@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from companion.core.controller import Memory, step
 from companion.core.crossings import Crossing, Route
 from companion.core.nozzle import allowed_duty
-from companion.core.schedule import Timing, orders, resolve, schedule
+from companion.core.schedule import Timing, has_passed, in_zone, orders, resolve, schedule
 from companion.core.types import PwmLimits, SprayPlan, TimedChange
 from companion.output.pwm import PulseEngine
 from tests.builders import LAG, flying, setup
@@ -184,3 +184,49 @@ def test_the_valves_do_not_open_together() -> None:
     assert len(opened) == 6
     apart = [(b - a) % T for a, b in pairwise([*opened, opened[0]])]
     assert apart == pytest.approx([T / 6] * 6, abs=1e-6)
+
+
+# ------------------------------------------- what is found for one valve and serves its neighbours
+
+RATES = st.sampled_from([None, 0.0, 15.0, 20.0, 25.0, 30.0])
+DUTIES = st.sampled_from([0.0, 0.2, 0.375, 0.376, 0.5, 0.51, 0.625, 0.75, 1.0])
+
+
+@given(
+    first=RATES,
+    second=RATES,
+    behind_s=st.floats(0.0, 0.5),
+    in_force=DUTIES,
+    speed_m_s=st.floats(4.5, 5.5),
+)
+def test_behind_its_last_crossing_a_valve_does_what_its_schedule_says(
+    first: float | None, second: float | None, behind_s: float, in_force: float, speed_m_s: float
+) -> None:
+    now_s = 7.0
+    route = (Crossing(6.0, first, False, 5.0), Crossing(now_s - behind_s, second, False, 5.0))
+    assert has_passed(route, now_s) is (first != second)
+    if first == second:
+        return
+    quick = in_zone(second, 3, dosing, in_force, speed_m_s, now_s, has_entered=True)
+    whole = schedule(
+        route, valve=3, timing=TIMING, dosing=dosing, in_force=in_force, speed_soon_m_s=speed_m_s,
+        now_s=now_s, until_s=now_s + 0.3,
+    )  # fmt: skip
+    assert quick == whole
+
+
+def test_what_lies_ahead_or_is_the_border_is_not_passed() -> None:
+    inside, zone = Crossing(6.0, 15.0, False, 5.0), Crossing(7.0, 20.0, False, 5.0)
+    assert has_passed((inside, zone), 7.0)
+    assert not has_passed((inside, zone), 6.999)
+    assert not has_passed((inside,), 7.0)
+    assert not has_passed((inside, zone, Crossing(7.1, 15.0, False, 5.0)), 7.2)
+    assert not has_passed((Crossing(6.0, None, True, 5.0), zone), 7.0)
+    assert not has_passed((inside, Crossing(7.0, None, True, 5.0)), 7.0)
+    assert not has_passed((inside, Crossing(math.nan, 20.0, False, 5.0)), 7.0)
+
+
+@pytest.mark.parametrize("restart", [True, False])
+def test_a_change_of_another_valve_is_the_same_change(restart: bool) -> None:
+    change = TimedChange(at_s=1.5, valve=0, duty=0.25, restart=restart)
+    assert change.of_valve(4) == TimedChange(at_s=1.5, valve=4, duty=0.25, restart=restart)

@@ -5,7 +5,7 @@ so ground that a later flight begins at such an edge gets its dose, neither more
 mean. What the schedule only meant to do is not looked at.
 
 The way since the last stamp is kept as a few states and stamped every other second, in pieces as
-long as they are straight: a step stays cheap.
+long as they are straight, by a step that has little else to do: a step stays cheap.
 """
 
 from __future__ import annotations
@@ -42,14 +42,11 @@ class BoomPose(NamedTuple):
 
 
 def swept(
-    boom: Boom,
-    poses: tuple[BoomPose, ...],
-    is_open: tuple[bool, ...],
-    flow_edges: tuple[FlowEdge, ...],
+    boom: Boom, poses: tuple[BoomPose, ...], is_open: tuple[bool, ...], edges: tuple[FlowEdge, ...]
 ) -> list[Quad]:
     """Return the quadrilaterals swept on the way through `poses`; `is_open` holds at the first."""
     way = _BoomPath(boom, poses)
-    stays = _stays(is_open, flow_edges, poses[0].time_s, poses[-1].time_s)
+    stays = _stays(is_open, edges, poses[0].time_s, poses[-1].time_s)
     return [quad for strip in _strips(boom, stays) for quad in way.quads(*strip)]
 
 
@@ -282,6 +279,8 @@ def open_at(
 
 # The way is stamped after this time: a area of 10 m at 5 m/s is one look at some 2000 cells.
 STAMP_EVERY_S = 2.0
+# No longer than this the stamp waits for a step that has the time; in a turn none has.
+UNSTAMPED_MAX_S = 1.0
 # States nearer than this add nothing to the way between them: within 0.2 s of braking by 2.5 m/s2
 # a place between two is off by a centimetre.
 POSE_STEP_M = 0.8
@@ -326,15 +325,29 @@ class Snapshot(NamedTuple):
     coverage: Coverage
 
 
+class Unstamped(NamedTuple):
+    """A way that has ended and is to be stamped, as long as a step takes, when there is time."""
+
+    boom: Boom
+    poses: tuple[BoomPose, ...]
+    is_open: tuple[bool, ...]
+    flow_edges: tuple[FlowEdge, ...]
+
+    def on(self, raster: Coverage) -> Coverage:
+        """Return what had been treated before it with its own ground added."""
+        return raster.stamped(swept(*self))
+
+
 class TreatedArea(NamedTuple):
     """What has been treated, and the way that is not yet stamped.
 
-    `poses` begin with the last stamp, `is_open` holds there; `flow_edges` come later, in the order
-    of their orders. `ordered` is what was ordered last. `way_m` is how far the boom had come at
-    `place` (east, north); what it flew closed counts as straight.
+    `raster` lacks the ground of `unstamped`, and so does the last of the `older`. `poses` begin
+    with the last way's end, `is_open` holds there; `flow_edges` come later, in the order of their
+    orders. `ordered` is what was ordered last. `way_m` is how far the boom had come at `place`
+    (east, north); what it flew closed counts as straight.
     """
 
-    coverage: Coverage
+    raster: Coverage
     older: tuple[Snapshot, ...] = ()
     poses: tuple[BoomPose, ...] = ()
     is_open: tuple[bool, ...] = ()
@@ -342,6 +355,24 @@ class TreatedArea(NamedTuple):
     flow_edges: tuple[FlowEdge, ...] = ()
     way_m: float = 0.0
     place: Place | None = None
+    unstamped: Unstamped | None = None
+
+    @property
+    def coverage(self) -> Coverage:
+        """Return all that had been treated when the last way ended."""
+        return self.raster if self.unstamped is None else self.unstamped.on(self.raster)
+
+    def may_wait(self, now_s: float) -> bool:
+        """Return whether what is left to be stamped may be left to a later step."""
+        return now_s - self.older[-1].until_s < UNSTAMPED_MAX_S
+
+    def settled(self) -> TreatedArea:
+        """Return the same with nothing left to be stamped."""
+        if self.unstamped is None:
+            return self
+        raster = self.coverage
+        last = self.older[-1]._replace(coverage=raster)
+        return self._replace(raster=raster, older=(*self.older[:-1], last), unstamped=None)
 
     def before(self, at_s: float, *, here: Place, behind_m: float) -> Coverage | None:
         """Return what had been treated by some time before `at_s`, the newest that is known.
@@ -350,10 +381,12 @@ class TreatedArea(NamedTuple):
         """
         way_m = self.came_m([*((x, y) for _, x, y, _ in self.poses), here]) - behind_m
         found = None
-        for until_s, at_m, coverage in self.older:
-            if until_s <= at_s and at_m <= way_m:
-                found = coverage
-        return found
+        for snapshot in self.older:
+            if snapshot.until_s <= at_s and snapshot.way_m <= way_m:
+                found = snapshot
+        if found is None:
+            return None
+        return self.coverage if found is self.older[-1] else found.coverage
 
     def came_m(self, places: Iterable[Place]) -> float:
         """Return how far the boom has come when it has gone on through these places."""
@@ -543,23 +576,20 @@ def _broken_off(
 
 def _stamped(boom: Boom, area: TreatedArea, pose: BoomPose) -> TreatedArea:
     """Return the area with its way to `pose` stamped."""
+    area = area.settled()
     poses = (*area.poses, pose) if pose.time_s > area.poses[-1].time_s else area.poses
     end_s = poses[-1].time_s
     is_open, later = open_at(area.is_open, area.flow_edges, end_s)
-    coverage = area.coverage
+    unstamped = None
     if len(poses) > 1 and (any(area.is_open) or len(later) < len(area.flow_edges)):
-        coverage = coverage.stamped(swept(boom, poses, area.is_open, area.flow_edges))
+        unstamped = Unstamped(boom, poses, area.is_open, area.flow_edges)
     come = area.come(pose)
     return TreatedArea(
-        coverage=coverage,
-        older=_kept(area.older, Snapshot(end_s, come.way_m, coverage), wake_m(boom)),
-        poses=poses[-1:],
-        is_open=is_open,
-        ordered=area.ordered,
-        flow_edges=later,
-        way_m=come.way_m,
-        place=come.place,
-    )
+        raster=area.raster,
+        older=_kept(area.older, Snapshot(end_s, come.way_m, area.raster), wake_m(boom)),
+        poses=poses[-1:], is_open=is_open, ordered=area.ordered, flow_edges=later,
+        way_m=come.way_m, place=come.place, unstamped=unstamped,
+    )  # fmt: skip
 
 
 def _kept(older: tuple[Snapshot, ...], new: Snapshot, behind_m: float) -> tuple[Snapshot, ...]:
