@@ -27,7 +27,7 @@ def raised(stops: Sequence[Stop], terrain: Terrain, *, home: Place, height_m: fl
     """
     home_m = float(terrain.heights_m(np.array([home]))[0])
     first_m = height_m if stops[0].height_m is None else stops[0].height_m
-    found = [replace(stops[0], height_m=_above(terrain, stops[0].place, home_m) + first_m)]
+    found = [stops[0]._replace(height_m=_above(terrain, stops[0].place, home_m) + first_m)]
     lines_m = height_m
     for before, after in pairwise(stops):
         height_m = lines_m if after.height_m is None else after.height_m
@@ -41,7 +41,7 @@ def raised(stops: Sequence[Stop], terrain: Terrain, *, home: Place, height_m: fl
             )
             for (east_m, north_m), ground_m in inner
         ]
-        found.append(replace(after, height_m=float(way.ground_m[-1]) - home_m + height_m))
+        found.append(after._replace(height_m=float(way.ground_m[-1]) - home_m + height_m))
     return found
 
 

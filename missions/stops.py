@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 from companion.core.frame import LocalFrame
 from companion.wording import counted
@@ -23,8 +24,7 @@ NEAR_M = 2.0
 RUN_M, ASIDE_M = 25.0, 0.05
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Stop:
+class Stop(NamedTuple):
     """A place of the way, the speed of the way to it, and whether a line begins or ends there.
 
     `height_m` is above home, or the ground that is followed; None leaves it to that of the lines.
@@ -126,7 +126,8 @@ def _without_runs(stops: list[Stop]) -> list[Stop]:
             if row.leaves_out(ends, opens=here.opens, on_line=here.on_line):
                 continue
         kept.append(here)
-        row = _Row()
+        if row.passed:
+            row = _Row()
     return kept
 
 
@@ -236,8 +237,7 @@ TOUCH_M = 1e-3
 SQUARE_DEG = 90.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Stretch:
+class _Stretch(NamedTuple):
     """A way between two waypoints; `legs` are (leg, metres) that it is of.
 
     One that leads `upright_m` up, or down, has both above each other.
@@ -324,7 +324,7 @@ def _ways(sortie: Sortie, lines_m: float) -> list[_Stretch]:
             # that it might be left out where it is written, or the other way round.
             here = _middle(leg.points[0], leg.points[-1])
             if found:
-                found[-1] = replace(found[-1], end=here)
+                found[-1] = found[-1]._replace(end=here)
             continue
         # A line that begins at one waypoint with the last one has no way to it.
         is_met = number > 0 and _is_no_way(sortie, number - 1)
@@ -368,7 +368,7 @@ def _ways_without_runs(ways: list[_Stretch], sprays: Sequence[bool]) -> list[_St
                 on_line=before or after,
             )
         ):
-            kept[-1] = replace(last, end=way.end, legs=(*last.legs, *way.legs))
+            kept[-1] = last._replace(end=way.end, legs=(*last.legs, *way.legs))
         else:
             kept.append(way)
             row = _Row()

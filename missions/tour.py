@@ -77,11 +77,11 @@ class Ring:
         return change_s + self.improve([before, after])
 
     def set(self, ends: list[int]) -> None:
-        """Take these ends."""
+        """Take these ends; a piece of which there is none is nowhere."""
         self.ends = ends
-        at = self._at
-        for place, enter in enumerate(ends):
-            at[enter >> 1] = place
+        at = np.full(len(self._at), -1)
+        at[np.array(ends) >> 1] = np.arange(len(ends))
+        self._at = at.tolist()
 
     def order(self) -> Sortie:
         """Return the pieces from the depot on."""

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from shapely import Polygon, box
 
 from companion.cli.app import execute
+from missions import layouts
 from missions.boom import Boom
 from missions.corners import Motion
 from missions.coverage import measure, reachable
@@ -31,6 +32,7 @@ from missions.prices import closing_hint, overlap_warnings
 from missions.selection import Aim, _Set, chosen, families
 from missions.sheet import sheet
 from missions.strips import border_passes, joined, lengths_m, rectangles, united, whole
+from missions.worth import Tour, worthwhile
 from tests.bench.small_fields import VALVES
 from tests.mission_fields import degrees
 from tests.small_fields import DITCH_M, KINDS, made_up
@@ -301,3 +303,24 @@ def test_lines_that_are_taken_and_dropped_are_counted_as_one_by_one() -> None:
         assert (bared is None) == (bare == 0)
         if bared is not None:
             assert covers[bared][times == 0].any()
+
+
+def test_chosen_lines_that_are_clearly_worse_are_not_gone_through_one_by_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    gone_through: list[Tour] = []
+
+    def counting(tour: Tour, *given: Any, **more: Any) -> Any:
+        gone_through.append(tour)
+        return worthwhile(tour, *given, **more)
+
+    monkeypatch.setattr(layouts, "worthwhile", counting)
+    ground = Polygon([(0.0, 0.0), (75.0, 9.0), (88.0, 66.0), (-6.0, 72.0)])
+    best = plan_of(ground)
+    every = len(gone_through)
+    monkeypatch.setattr(layouts, "WORSE", 0.0)
+    without = plan_of(ground)
+    # The layouts' alone: none of the chosen ones, of which two were looked at.
+    assert len(gone_through) - every < every
+    assert best.flight_s <= without.flight_s
+    assert without.coverage.reachable_percent >= 99.8
