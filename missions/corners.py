@@ -19,6 +19,7 @@ import numpy as np
 
 from missions.strips import Floats
 
+Ints = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 CornerRule = Literal["stop", "ardupilot", "px4"]
 
 # ArduPilot's WPNAV_RADIUS, and WPNAV_ACCEL_C at 0: twice the acceleration of the legs.
@@ -363,6 +364,10 @@ Turn = Literal["stop", "strafe", "rounded"]
 # Passes so long, in accelerations, reach their speed; ways aside between them are tabled so far.
 LONG, ASIDE_KNOTS_M = 10.0, np.geomspace(0.05, 20_000.0, 160)
 SQUARE_DEG = 90.0
+# Shorter passes are left before the corner before them is done; ways aside as short as passes are.
+SHORT_KNOTS_M = np.array([0.5, 1.5, 3.0, 5.0, 8.0, 12.0, 18.0, 28.0, 45.0])
+BESIDE_KNOTS_M = np.array([0.5, 2.0, 4.0, 6.0, 9.0, 13.0, 20.0, 35.0, 60.0])
+LONG_PASS_M = 300.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -422,6 +427,22 @@ class Motion:
         added[is_short] = self.legs_s(short_m) - np.interp(short_m, ASIDE_KNOTS_M, spared_s)
         return added
 
+    def short_s(self, pass_m: Floats, aside_m: Floats) -> Floats:
+        """Return what a way aside takes more for each short pass at its ends, shape of both.
+
+        >>> motion = Motion(
+        ...     speed_m_s=6.0, acceleration_m_s2=2.5, jerk_m_s3=1.0, corners="ardupilot"
+        ... )
+        >>> motion.short_s(np.array([[4.0], [200.0]]), np.array([6.0])).round(1).tolist()
+        [[1.0], [0.0]]
+        """
+        table_s = _short_passes_s(self)
+        low, share = _between_knots(pass_m, SHORT_KNOTS_M)
+        left, part = _between_knots(aside_m, BESIDE_KNOTS_M)
+        one: Floats = table_s[low, left] * (1.0 - part) + table_s[low, left + 1] * part
+        other: Floats = table_s[low + 1, left] * (1.0 - part) + table_s[low + 1, left + 1] * part
+        return one * (1.0 - share) + other * share
+
     def spared_straight_s(self, one_m: Floats, other_m: Floats) -> Floats:
         """Return what two legs take less than from rest to rest, where one goes on in the other.
 
@@ -443,6 +464,31 @@ class Motion:
             acceleration_m_s2=self.acceleration_m_s2,
             jerk_m_s3=self.jerk_m_s3,
         )
+
+
+def _between_knots(values: Floats, knots: Floats) -> tuple[Ints, Floats]:
+    """Return the knot below each value, the last but one at most, and how far on to the next."""
+    low = np.clip(np.searchsorted(knots, values, side="right") - 1, 0, len(knots) - 2)
+    share: Floats = np.clip((values - knots[low]) / (knots[low + 1] - knots[low]), 0.0, 1.0)
+    return low, share
+
+
+@lru_cache(maxsize=64)
+def _short_passes_s(motion: Motion) -> Floats:
+    """Return what a corner beside a short pass spares less, by its length and the way aside."""
+    if motion.corners == "stop":
+        return np.zeros((len(SHORT_KNOTS_M), len(BESIDE_KNOTS_M)))
+    course = motion.at(motion.speed_m_s)
+    bends_deg = (SQUARE_DEG, SQUARE_DEG, -SQUARE_DEG, -SQUARE_DEG)
+    found = np.zeros((len(SHORT_KNOTS_M), len(BESIDE_KNOTS_M)))
+    for at, aside_m in enumerate(BESIDE_KNOTS_M.tolist()):
+        taken = []
+        for pass_m in (*SHORT_KNOTS_M.tolist(), 2.0 * LONG_PASS_M):
+            parts_m = (LONG_PASS_M, aside_m, pass_m, aside_m, LONG_PASS_M)
+            flown_s = sum(parts_s(parts_m, bends_deg, (course,) * 5, motion.corners))
+            taken.append(flown_s - motion.leg_s(pass_m))
+        found[:, at] = (np.array(taken[:-1]) - taken[-1]) / 2.0
+    return np.maximum(found, 0.0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import shapely
@@ -29,7 +30,7 @@ MARGIN_M = 0.0025
 # outside of their buffers: a circle of 5 m becomes one of ten corners. Where many obstacles would
 # take more of the ground than that share, it is the next lesser distance.
 OUTLINE_TOLERANCE_M = 0.1
-OBSTACLE_TOLERANCES_M = (0.5, 0.25, 0.12, 0.06, 0.03)
+OBSTACLE_TOLERANCES_M = (0.5, 0.35, 0.25, 0.18, 0.12, 0.085, 0.06, 0.042, 0.03)
 OBSTACLE_SHARE = 0.0009
 # Of round corners those are left out first that lie so close to the chord, on ground grown by it.
 CLOSE_M = 0.003
@@ -56,6 +57,11 @@ class High:
     blocked: BaseGeometry
 
 
+# What is not sprayed: obstacles by how they are drawn, with their buffers, and areas.
+Kind = Literal["point", "line", "area", "hole", "no spray"]
+DRAWN: tuple[Kind, ...] = ("point", "line", "area")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Field:
     """`outline` is as given; `fly` lies in it without holes and obstacles; `spray` in `fly`.
@@ -65,6 +71,7 @@ class Field:
     `blocked` is what may not be flown over, not even on the way to the field. `closes` is the
     ground outside of which the companion closes its valves, where that is another than `limit`.
     `high` is the same for ferries, which cross low obstacles; None where they cross none.
+    `closed` is what is not sprayed, by its kind.
     """
 
     frame: LocalFrame
@@ -77,6 +84,7 @@ class Field:
     tolerance_m: float = OUTLINE_TOLERANCE_M
     given_up_m2: float = 0.0
     high: High | None = None
+    closed: tuple[tuple[Kind, BaseGeometry], ...] = ()
 
     @property
     def kept_in(self) -> BaseGeometry:
@@ -174,7 +182,23 @@ def build_field(
         tolerance_m=tolerance_m,
         given_up_m2=given_up_m2,
         high=high,
+        closed=_closed_by_kind(given, grounds, holes, closed),
     )
+
+
+def _closed_by_kind(
+    given: Sequence[Obstacle],
+    grounds: Sequence[BaseGeometry],
+    holes: Sequence[Polygon],
+    no_spray: BaseGeometry,
+) -> tuple[tuple[Kind, BaseGeometry], ...]:
+    """Return what is not sprayed; what is of several kinds, as the last of them."""
+    found: dict[Kind, list[BaseGeometry]] = {"no spray": [no_spray], "hole": list(holes)}
+    for each, ground in zip(given, grounds, strict=True):
+        kind = DRAWN[int(shapely.get_dimensions(each.geometry))]
+        found.setdefault(kind, []).append(ground)
+    united = {kind: shapely.union_all(some) for kind, some in found.items()}
+    return tuple((kind, ground) for kind, ground in united.items() if not ground.is_empty)
 
 
 def _kept_away_from(

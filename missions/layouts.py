@@ -43,7 +43,16 @@ from missions.strips import (
     whole,
 )
 from missions.worth import LEFT_SHARE as WORTH_LEFT
-from missions.worth import LINES_MAX, WORTH, Crowded, Tour, tour_of, without_stubs, worthwhile
+from missions.worth import (
+    LINES_MAX,
+    WORTH,
+    Crowded,
+    Tour,
+    meeting,
+    tour_of,
+    without_stubs,
+    worthwhile,
+)
 
 # Of the best courses so many are drawn in full; of the layouts so many are gone through line by
 # line, and only the best one where it has more lines than this.
@@ -117,7 +126,10 @@ class _Covering:
             tour, self.target, self.boom, left_share=self.left_share,
             worth=LEFT_WORTH if self.settings.leave_max_percent > LEAVE_PERCENT else WORTH,
         )  # fmt: skip
-        return self.tour(kept)
+        return meeting(
+            self.tour(kept), self.target, self.field.spray, self.boom, left_share=self.left_share,
+            overlap_s_m2=self.aim.doubled_s_m2,
+        )  # fmt: skip
 
     def selected(
         self, drawn: list[Floats], angles_deg: list[float], *, best_s: float

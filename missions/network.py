@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from missions.corners import Motion
+from missions.corners import SHORT_KNOTS_M, Motion
 from missions.demand import Pieces
 from missions.free_space import Bools, FreeSpace
 from missions.strips import Floats, directions, lengths_m
@@ -30,6 +30,8 @@ JOIN_M, JOIN_DEG = 0.6, 15.0
 # were none, for its waypoint's radius of 2 m lets both be 2.6 m from their common end.
 SOFT_DEG = 45.0
 SOFT = math.cos(math.radians((JOIN_DEG + SOFT_DEG) / 2.0))
+# A way around a corner has a waypoint there: measured on plans with trees, 2.5 to 4 s for each.
+BENT_S = 3.0
 # Parts of one line on both sides of ground that is not sprayed, flown on without a turn.
 ACROSS_M, STRAIGHT_M, ONWARD = 60.0, 0.05, 1.0 - 1e-6
 # Ways as long as the straight one, but for rounding.
@@ -89,12 +91,18 @@ def build_network(
     between = np.zeros((count + 2, count + 2), dtype=np.float32 if is_large else np.float64)
     far_m = between[:count, :count]
     near = _measured(far_m, ends)
-    if not space.is_convex:
-        _bend(far_m, ends, near, space)
+    hidden = None if space.is_convex else _bend(far_m, ends, near, space)
     near_m = np.take_along_axis(far_m, near, axis=1)
+    length_m = lengths_m(pieces.ends)
+    short = np.flatnonzero(np.repeat(length_m, 2) < SHORT_KNOTS_M[-1])
+    short = short[:0] if is_large else short
+    more_s = motion.short_s(np.repeat(length_m, 2)[short, None], far_m[short])
     for first in range(0, count, TOGETHER):
         far_m[first : first + TOGETHER] = motion.ways_s(far_m[first : first + TOGETHER])
-    length_m = lengths_m(pieces.ends)
+    far_m[short] += more_s
+    far_m[:, short] += more_s.T
+    if hidden is not None and motion.corners != "stop":
+        far_m[hidden] += BENT_S
     bend = math.cos(math.radians(soft_bend_deg(motion)))
     rows, columns = _flown_through(pieces.ends, near_m, near, bend)
     spared_s = motion.spared_straight_s(length_m[rows >> 1], length_m[columns >> 1])
@@ -207,8 +215,8 @@ def _know(near: Ints, rows: Ints, columns: Ints) -> None:
             near[one, -1] = other
 
 
-def _bend(far_m: Floats, ends: Floats, near: Ints, space: FreeSpace) -> None:
-    """Put the length of the bent way where two ends do not see each other."""
+def _bend(far_m: Floats, ends: Floats, near: Ints, space: FreeSpace) -> tuple[Ints, Ints] | None:
+    """Put the length of the bent way where two ends do not see each other; return those pairs."""
     count = len(ends)
     if count * count <= SIGHTS_MAX:
         rows, columns = np.triu_indices(count, 1)
@@ -217,7 +225,7 @@ def _bend(far_m: Floats, ends: Floats, near: Ints, space: FreeSpace) -> None:
     hidden = ~_see_each_other(ends, rows, columns, space)
     rows, columns = rows[hidden], columns[hidden]
     if not len(rows) or not len(space.corners):
-        return
+        return None
     to_corners = space.to_corners_m(ends)
     bent = np.empty(len(rows))
     ordered = np.argsort(rows, kind="stable")
@@ -229,6 +237,8 @@ def _bend(far_m: Floats, ends: Floats, near: Ints, space: FreeSpace) -> None:
     # No way through: far apart for the search, whatever the ferry around will cost.
     bent = np.where(np.isfinite(bent), bent, 3.0 * far_m[rows, columns] + 1000.0)
     far_m[rows, columns] = far_m[columns, rows] = bent
+    pairs = np.unique(np.concatenate([rows * count + columns, columns * count + rows]))
+    return pairs // count, pairs % count
 
 
 def _see_each_other(ends: Floats, rows: Ints, columns: Ints, space: FreeSpace) -> Bools:

@@ -20,6 +20,7 @@ from companion.map_pictures import draw_below
 from companion.wording import counted, install_command
 from missions.boom import boom_of
 from missions.errors import PlanError
+from missions.field import Kind
 from missions.maps.local import polygons_of
 from missions.maps.model import write_whole
 from missions.maps.picture import STYLE, SUFFIXES, Sheet, content_of, printable, sheet_for
@@ -121,10 +122,16 @@ def _draw_field(axes: Axes, plan: Plan) -> bool:
     field = plan.field
     _fill(axes, [field.outline], facecolors=FIELD, edgecolors="black", linewidths=1.3, zorder=1.0)
     closed = shapely.union_all([field.blocked, field.outline.difference(field.limit)])
-    _fill(
-        axes, [closed], facecolors="0.9", edgecolors=CLOSED, hatch="////", linewidths=0.8,
-        zorder=1.5,
-    )  # fmt: skip
+    _fill(axes, [closed], facecolors="0.9", edgecolors=CLOSED, linewidths=0.8, zorder=1.5)
+    others = closed.difference(shapely.union_all([ground for _, ground in field.closed]))
+    for kind, ground in (*field.closed, (None, others.buffer(-SEEN_M))):
+        colour, hatch, _ = KINDS[kind]
+        _fill(axes, [ground], facecolors="none", edgecolors=colour, hatch=hatch, linewidths=0.8,
+              zorder=1.6)  # fmt: skip
+        if kind == "point":
+            middles = shapely.get_coordinates(shapely.centroid(shapely.get_parts(ground)))
+            axes.plot(*middles.T, linestyle="", marker="^", markersize=7, color=colour,
+                      markeredgecolor="white", zorder=6.5)  # fmt: skip
     return not closed.is_empty
 
 
@@ -256,6 +263,15 @@ LISTED_MAX, ROW_IN = 26, 0.26
 # Of the arrow of the wind.
 WIND_IN, WIND = 0.6, "#1f5fa8"
 SKIPPED, TWICE, CLOSED, FIELD = "#d0021b", "#1a1a1a", "#8a8a8a", "#f4f1ea"
+# What is not sprayed, by its kind: colour, hatching, words.
+KINDS: dict[Kind | None, tuple[str, str, str]] = {
+    "point": ("#1b5e20", "", "tree or pole, with buffer"),
+    "line": ("#8a4b00", "||||", "power line or wire, with corridor"),
+    "area": ("#4a148c", "xxxx", "building or other obstacle"),
+    "hole": (CLOSED, "////", "not to be sprayed: hole of the field"),
+    "no spray": ("#b71c1c", "....", "not to be sprayed, may be crossed"),
+    None: (CLOSED, "////", "not to be sprayed"),
+}
 Colour = tuple[float, float, float]
 
 
@@ -345,6 +361,21 @@ def _speeds(plan: Plan) -> tuple[float, float]:
     return min(low for low, _ in speeds), max(high for _, high in speeds)
 
 
+def _closed_handles(plan: Plan) -> list[Any]:
+    """Return the legend of what is not sprayed, a row for each kind."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    found: list[Any] = []
+    kinds: list[Kind | None] = [kind for kind, _ in plan.field.closed]
+    for kind in kinds or [None]:
+        colour, hatch, words = KINDS[kind]
+        patch = Patch(facecolor="0.9", edgecolor=colour, hatch=hatch, label=words)
+        mark = Line2D([], [], color=colour, marker="^", markersize=8, linestyle="", label=words)
+        found.append(mark if kind == "point" else patch)
+    return found
+
+
 def write_legend(figure: Figure, plan: Plan, seen: dict[str, bool], *, left: float) -> None:
     """Say what is drawn, and list the sorties for which there is room."""
     from matplotlib.lines import Line2D
@@ -372,9 +403,7 @@ def write_legend(figure: Figure, plan: Plan, seen: dict[str, bool], *, left: flo
     if seen["bare"]:
         handles.append(Patch(facecolor=FIELD, edgecolor="0.6", label="nothing prescribed"))
     if seen["closed"]:
-        handles.append(
-            Patch(facecolor="0.9", edgecolor=CLOSED, hatch="////", label="not to be sprayed")
-        )
+        handles += _closed_handles(plan)
     room = max(4, math.floor((high_in - ABOVE_IN) / ROW_IN) - len(handles) - 2)
     listed = plan.sorties[: min(LISTED_MAX, room)]
     for sortie in listed:

@@ -15,16 +15,25 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from missions.boom import Boom
+from missions.boom import SLACK_M, Boom
 from missions.corners import Motion
 from missions.demand import Pieces
 from missions.free_space import FreeSpace
-from missions.network import JOIN_M, Network, build_network
+from missions.network import JOIN_M, Ints, Network, build_network, soft_bend_deg
 from missions.paced import Paced
 from missions.plan import Leg
 from missions.plan import Sortie as FlownSortie
 from missions.stops import NEAR_M, near_pairs, waypoints_of
-from missions.strips import LINE_MIN_M, Bools, Floats, Objects, directions, lengths_m, whole
+from missions.strips import (
+    LINE_MIN_M,
+    Bools,
+    Floats,
+    Objects,
+    directions,
+    lengths_m,
+    rectangles,
+    whole,
+)
 from missions.tour import Ring, Sortie, by_savings, cost_s, one_chain, shortest_tour
 from missions.ways import Ways
 
@@ -270,6 +279,22 @@ class _Ground:
         parts: Objects = shapely.get_parts(shapely.difference(own, whole(others)))
         return parts
 
+    def lost_m2(self, pair: Ints, met: Floats) -> float:
+        """Return how much ground is no longer covered if two lines become others."""
+        old, new = self._strips[pair], self._boom.strips(met)
+        gone = shapely.intersection(whole(old).difference(whole(new)), self._target)
+        if gone.is_empty:
+            return 0.0
+        near = self._near.query(gone, predicate="intersects")
+        others = self._strips[near[self.kept[near] & ~np.isin(near, pair)]]
+        return float(shapely.area(self._parts(gone, others)).sum())
+
+    def put(self, pair: Ints, met: Floats) -> None:
+        """Have two lines become others."""
+        self.lines[pair] = met
+        self._strips[pair] = self._boom.strips(met)
+        self._near = shapely.STRtree(self._strips.copy())
+
     def trim(self, at: int) -> None:
         """Cut off the ends of a line that others cover, and from which none goes on."""
         joins = [self._joins(at, end) for end in self.lines[at].reshape(2, 2).copy()]
@@ -321,6 +346,7 @@ class Tour:
     network: Network
     order: Sortie
     motion: Motion
+    space: FreeSpace
 
     @property
     def seconds(self) -> float:
@@ -328,13 +354,110 @@ class Tour:
         flown_s = float(self.motion.legs_s(lengths_m(self.lines)).sum())
         return flown_s + cost_s(self.network, [self.order])
 
+    def again(self, lines: Floats) -> Tour:
+        """Return a tour of the same lines, as they are now, in the same order to begin with."""
+        network = _network(lines, self.space, self.motion)
+        order = shortest_tour(network, self.order, kicks=KICKS_MIN)
+        return replace(self, lines=lines, network=network, order=order)
+
+
+def _network(lines: Floats, space: FreeSpace, motion: Motion) -> Network:
+    count = len(lines)
+    pieces = Pieces(ends=lines, litres=np.zeros(count), line=np.arange(count))
+    return build_network(pieces, space, motion)
+
 
 def tour_of(lines: Floats, space: FreeSpace, motion: Motion) -> Tour:
     """Return a good tour of some lines."""
     count = len(lines)
-    pieces = Pieces(ends=lines, litres=np.zeros(count), line=np.arange(count))
-    network = build_network(pieces, space, motion)
+    network = _network(lines, space, motion)
     order = one_chain(network, by_savings(network, 1.0))
     kicks = min(max(KICKS_MIN, KICKS // count**2), KICKS_MAX)
     order = shortest_tour(network, order, kicks=kicks)
-    return Tour(lines=lines, network=network, order=order, motion=motion)
+    return Tour(lines=lines, network=network, order=order, motion=motion, space=space)
+
+
+# Neighbours of a tour that meet in one corner, which is flown through.
+#
+# A pass along a border goes on past its corner, as far as the outer side of its strip needs, and
+# the next one begins as far before it: an aircraft that flies both to their ends turns back between
+# them. So does one whose two passes end before a corner. Where other lines cover what the first of
+# these cover past the corner, both end in it.
+
+# Ends so far from the corner are moved there, those past it and those before it.
+PAST_MAX_M, SHORT_MAX_M = 3.0, 8.0
+# Lines with less bend between them have no corner; less ground is rounding.
+ONE_SINE, ROUNDING_M2 = 1e-3, 1e-3
+
+
+def meeting(
+    tour: Tour, target: BaseGeometry, ground: BaseGeometry, boom: Boom, *, left_share: float,
+    overlap_s_m2: float,
+) -> Tour:  # fmt: skip
+    """Return a tour whose neighbours meet in a corner where that is quicker.
+
+    What is sprayed twice for it costs `overlap_s_m2`.
+    """
+    if len(tour.lines) < 2:
+        return tour
+    motion, lines = tour.motion, _Ground(tour.lines, target, boom)
+    spare_m2 = left_share * target.area - target.difference(boom.united(tour.lines)).area
+    pays_m2_s = WORTH * motion.speed_m_s * boom.width_m
+    bend = math.cos(math.radians(soft_bend_deg(motion)))
+    is_changed = False
+    for before, after in zip(tour.order[:-1], tour.order[1:], strict=True):
+        corner = _corner(_flown(lines.lines, before), _flown(lines.lines, after), bend)
+        if corner is None:
+            continue
+        pair = np.array([before >> 1, after >> 1])
+        met = lines.lines[pair].copy()
+        met[0, _end_of(before ^ 1)], met[1, _end_of(after)] = corner, corner
+        long_m = lengths_m(met)
+        if long_m.min() < LINE_MIN_M or not _stay(met, lines.lines[pair], ground, boom.width_m):
+            continue
+        was_s = float(tour.network.between_s[before ^ 1, after])
+        was_s += float(motion.legs_s(lengths_m(lines.lines[pair])).sum())
+        is_s = float(motion.legs_s(long_m).sum())
+        is_s -= float(motion.spared_straight_s(long_m[:1], long_m[1:])[0])
+        more_m = float((long_m - lengths_m(lines.lines[pair])).sum())
+        gain_s = was_s - is_s - max(more_m, 0.0) * boom.width_m * overlap_s_m2
+        lost_m2 = lines.lost_m2(pair, met) if gain_s > 0.0 else math.inf
+        if lost_m2 > max(spare_m2, ROUNDING_M2) or not lost_m2 < pays_m2_s * gain_s:
+            continue
+        spare_m2 -= lost_m2
+        lines.put(pair, met)
+        is_changed = True
+    return tour if not is_changed else tour.again(lines.lines)
+
+
+def _flown(lines: Floats, enter: int) -> Floats:
+    """Return where the line of a piece that is entered at this end begins and ends."""
+    row = lines[enter >> 1]
+    return row if not enter & 1 else np.roll(row, 2)
+
+
+def _end_of(end: int) -> slice:
+    return slice(2, 4) if end & 1 else slice(0, 2)
+
+
+def _corner(one: Floats, other: Floats, bend: float) -> Floats | None:
+    """Return where two lines meet, if that is near to the end of one and the start of the other."""
+    along, onward = directions(np.array([one, other]))
+    gap = other[:2] - one[2:]
+    sine, cosine = along[0] * onward[1] - along[1] * onward[0], float(along @ onward)
+    if cosine < bend or abs(sine) < ONE_SINE or float(np.hypot(*gap)) < SAME_M:
+        return None
+    ahead_m = (gap[0] * onward[1] - gap[1] * onward[0]) / sine
+    late_m = (gap[0] * along[1] - gap[1] * along[0]) / sine
+    # From the corner on to where the other begins: below zero where that is before the corner.
+    if not (-PAST_MAX_M < ahead_m < SHORT_MAX_M and -PAST_MAX_M < -late_m < SHORT_MAX_M):
+        return None
+    corner: Floats = one[2:] + along * ahead_m
+    return corner
+
+
+def _stay(met: Floats, were: Floats, ground: BaseGeometry, width_m: float) -> bool:
+    """Return whether lines that have become longer keep their strips on the ground."""
+    longer = lengths_m(met) > lengths_m(were)
+    strips = rectangles(met[longer], width_m - 2.0 * SLACK_M)
+    return bool(shapely.covers(ground, strips).all())

@@ -9,11 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from shapely import Polygon
+from shapely import LineString, Point, Polygon, box
 
 from companion.cli.app import execute
-from missions.picture import colour_of, draw_plan, sprayed_twice
+from missions.demand import Uniform
+from missions.field import build_field
+from missions.picture import KINDS, colour_of, draw_plan, sprayed_twice
+from missions.plan import Settings
+from missions.planner import plan_mission
+from missions.reading_outline import Obstacle
 from missions.strips import rectangles
+from tests.mission_fields import degrees
 from tests.missions.test_missions_cli import written
 
 pytestmark = pytest.mark.usefixtures("searched_briefly")
@@ -56,6 +62,28 @@ def test_a_plan_is_drawn_with_all_of_its_sorties(
     for words_shown in (f"sortie {sorties} ", "sprayed twice", "not to be sprayed", "depot"):
         assert f"<!-- {words_shown}" in text
     assert "left unsprayed" not in text  # square corners, all covered
+
+
+def test_each_kind_of_ground_that_is_not_sprayed_has_a_sign_of_its_own(tmp_path: Path) -> None:
+    ground = Polygon([(0, 0), (160, 0), (160, 90), (0, 90)], [[(20, 20), (34, 20), (34, 40)]])
+    obstacles = [
+        Obstacle(geometry=degrees(Point(60.0, 40.0)), beyond_m=3.0),
+        Obstacle(geometry=degrees(LineString([(90.0, -5.0), (95.0, 95.0)])), beyond_m=4.0),
+        Obstacle(geometry=degrees(box(120.0, 30.0, 130.0, 40.0))),
+    ]
+    field = build_field(
+        degrees(ground), obstacles=obstacles, no_spray=[degrees(box(140.0, 60.0, 150.0, 70.0))],
+        swath_width_m=6.0,
+    )  # fmt: skip
+    plan = plan_mission(
+        field, Settings(swath_width_m=6.0, speed_m_s=6.0, moves=0), Uniform(rate_l_ha=20.0),
+        depots=(field.frame.to_geographic(-75.0, 0.0),),
+    )  # fmt: skip
+    draw_plan(plan, tmp_path / "m.svg", title="field")
+    text = (tmp_path / "m.svg").read_text()
+    signs = {f"<!-- {words} -->" for kind, (_, _, words) in KINDS.items() if kind is not None}
+    assert len(signs) == 5 and all(each in text for each in signs)
+    assert f"<!-- {KINDS[None][2]} -->" not in text
 
 
 def test_ground_on_which_valves_close_is_not_said_to_be_sprayed_twice(

@@ -31,7 +31,7 @@ def plan_with(autopilot: Any) -> Plan:
     from shapely import box
 
     field = build_field(
-        to_degrees(box(0, 0, 200, 120)), obstacles=[to_degrees(box(90, 50, 100, 60))],
+        to_degrees(box(0, 0, 200, 140)), obstacles=[to_degrees(box(90, 50, 100, 60))],
         swath_width_m=6.0, frame=FRAME,
     )  # fmt: skip
     settings = Settings(
