@@ -190,7 +190,7 @@ def test_a_record_is_evaluated_again_and_written_into_the_configuration(
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("{}", "is no record"),
+        ("{}", "is not a record"),
         ("nonsense", "cannot be read"),
         ('{"format": "vrspray-valves-1", "valves": ["a"]}', "other valves"),
         ('{"format": "vrspray-valves-1", "valves": ["1","2","3","4","5","6"]}', "is damaged"),
