@@ -101,6 +101,7 @@ def crawling(short_s: float, *, rate_l_ha: float = 20.0, long_m: float = 100.0) 
 def test_short_passes_that_are_flown_at_walking_pace_are_told_with_what_falls_there() -> None:
     # 20 L/ha on 6 m at 1.2 m/s: 0.864 L/min, where the valves give 2.
     (text,) = crawl_warnings([crawling(2.5)], FRAME, settings())
+    assert "WPNAV_JERK (mission.jerk_m_s3)" in text
     assert "30 m of passes" in text
     assert "1.2 m/s" in text
     assert "131 % too much (2.00 L/min at least)" in text
