@@ -113,7 +113,7 @@ def test_the_units_own_column_comes_before_the_general_one() -> None:
 
 def test_the_name_of_the_column_can_state_the_unit() -> None:
     assert unit(rate="dose_l_ha") == "L/ha"
-    with pytest.raises(MapError, match="no volume per area"):
+    with pytest.raises(MapError, match="not a volume per area"):
         unit(rate="dose_kg_ha")
 
 
