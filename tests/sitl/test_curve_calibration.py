@@ -305,7 +305,7 @@ def test_without_a_meter_it_says_what_to_do(capsys: pytest.CaptureFixture[str]) 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("{}", "is no record"),
+        ("{}", "is not a record"),
         ('{"format": "vrspray-curve-1", "valves": ["a"]}', "other valves"),
         ('{"format": "vrspray-curve-1", "valves": ["1","2","3","4","5","6"]}', "is damaged"),
     ],
