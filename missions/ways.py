@@ -233,8 +233,10 @@ def edge_places(field: Field, *, step_m: float, count_max: int) -> Floats:
         [shapely.get_exterior_ring(part) for part in shapely.get_parts(field.outline)]
     )
     far_m = shapely.distance(edges, shapely.points(places))
+    # Beside an obstacle across the edge the drawn border may touch what is blocked around it.
+    is_free = np.array([not _is_in(field.blocked, *place) for place in places.tolist()])
     # So far inside the border may be drawn.
-    outer: Floats = places[far_m <= max(field.tolerance_m, ON_EDGE_M)]
+    outer: Floats = places[(far_m <= max(field.tolerance_m, ON_EDGE_M)) & is_free]
     if not len(outer):
         raise PlanError(
             "obstacles stand along the whole edge of the field, and no place on it can be "
