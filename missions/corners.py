@@ -434,7 +434,7 @@ class Motion:
         ...     speed_m_s=6.0, acceleration_m_s2=2.5, jerk_m_s3=1.0, corners="ardupilot"
         ... )
         >>> motion.short_s(np.array([[4.0], [200.0]]), np.array([6.0])).round(1).tolist()
-        [[1.0], [0.0]]
+        [[0.4], [0.0]]
         """
         table_s = _short_passes_s(self)
         low, share = _between_knots(pass_m, SHORT_KNOTS_M)

@@ -215,8 +215,8 @@ GAP_MIN_M = 10.0
 def stretches(at_m: Floats, litres: Floats, *, margin_m: float) -> list[tuple[float, float]]:
     """Return from where to where along a line something is prescribed, and `margin_m` around it.
 
-    `litres` is what the line needs up to each of `at_m`. The margin is for speeding up before
-    the first rate and braking after the last one, as far as the line is long.
+    `litres` is what the line needs up to each of `at_m`. The margin is for speeding up, and
+    looking ahead, before the first rate and braking after the last one, as far as the line is long.
 
     >>> at = np.array([0.0, 40.0, 60.0, 100.0])
     >>> stretches(at, np.array([0.0, 0.0, 2.0, 2.0]), margin_m=5.0)

@@ -26,6 +26,9 @@ Kind = Literal["spray", "transit", "ferry"]
 # allowed.
 LEAVE_PERCENT = 0.2
 JERKS_M_S3 = {"ardupilot": 1.0, "px4": 4.0}
+# How fast the nose looks along the way again, by ATC_SLEW_YAW of ArduCopter, MPC_YAWRAUTO_MAX of
+# PX4; the most that it has to.
+NOSE_DEG_S, HALF_TURN_DEG = 60.0, 180.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,6 +104,17 @@ class Settings:
             speed_m_s=self.speed_m_s, acceleration_m_s2=self.acceleration_m_s2, jerk_m_s3=jerk,
             turn=self.turn, corners=rule,
         )  # fmt: skip
+
+    @property
+    def lead_m(self) -> float:
+        """Return the way after a turn back until the aircraft has its speed and its nose ahead.
+
+        Until then the boom swings: its ends go over other ground than they do along the line.
+        """
+        gaining_s, turning_s = self.speed_m_s / self.acceleration_m_s2, 0.0
+        if self.turn != "strafe":
+            turning_s = HALF_TURN_DEG / (self.nose_rate_deg_s or NOSE_DEG_S)
+        return self.speed_m_s * (gaining_s / 2.0 + max(turning_s - gaining_s, 0.0))
 
     @property
     def vertical(self) -> Vertical:

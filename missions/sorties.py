@@ -193,20 +193,17 @@ class SortieSearch:
             raise _out_of_reach(place, float(far_m[worst]), needed_wh, self.ways, settings)
 
     @cached_property
-    def _margin_m(self) -> float:
-        return self.settings.speed_m_s**2 / (2.0 * self.settings.acceleration_m_s2)
-
-    @cached_property
     def _whole(self) -> Pieces:
         """Return the lines, none cut."""
-        return cut(self.lines, self.demand, piece_max_l=math.inf, margin_m=self._margin_m)
+        return cut(self.lines, self.demand, piece_max_l=math.inf, margin_m=self.settings.lead_m)
 
     @cached_property
     def _pieces(self) -> Pieces:
         settings = self.settings
         return cut(
             self.lines, self.demand, piece_max_l=_piece_max_l(self.demand, settings),
-            piece_max_m=_piece_max_m(self.demand, settings, self.flying), margin_m=self._margin_m,
+            piece_max_m=_piece_max_m(self.demand, settings, self.flying),
+            margin_m=settings.lead_m,
         )  # fmt: skip
 
     @cached_property

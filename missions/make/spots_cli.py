@@ -370,8 +370,7 @@ def _plans(
                                    if one.geom_type == "Polygon"]), rate)  # fmt: skip
     whole = passes_of(field.lines, passes.angle_deg, task.field.limit, field.swath_m)
     # At the planned speed over the first spot, and over the last one still.
-    lead_m = task.settings.speed_m_s**2 / (2.0 * task.settings.acceleration_m_s2)
-    rows = pieces(opened, passes.edges_m, whole.edges_m, lead_m + LEAD_M)
+    rows = pieces(opened, passes.edges_m, whole.edges_m, task.settings.lead_m + LEAD_M)
     spans: dict[float, tuple[float, float]] = {}
     for start, end, right in rows:
         low, high = spans.get(right, (start, end))

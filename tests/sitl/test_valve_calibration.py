@@ -416,7 +416,7 @@ def counted(reports: list[tuple[float, float | None]]) -> str:
 
 def test_counts_that_cannot_be_used_are_said() -> None:
     assert counted([(0.0, 5.0), (0.3, 5.0), (0.6, 8.0)]) == ""
-    assert "begun anew" in counted([(0.0, 5.0), (0.3, 0.0)])
+    assert "has restarted" in counted([(0.0, 5.0), (0.3, 0.0)])
     assert "for 3.0 s" in counted([(0.0, 5.0), (3.0, 30.0)])
     assert "no count" in counted([(0.0, None)])
 
