@@ -46,9 +46,10 @@ def norths(leg: Leg) -> tuple[float, float]:
 def test_a_bare_end_is_not_flown_and_nothing_is_lost() -> None:
     plan = planned(Bare(-1.0, 250.0))
     assert plan.volume_l == pytest.approx(150.0 * 48.0 * 20.0 / 1e4, rel=0.02)
-    # 7.2 m to speed up from rest to 6 m/s, and the step in which the rate begins.
+    # 10.8 m: 2.4 s to speed up from rest to 6 m/s, 0.6 s more until the nose is ahead after a turn
+    # back at 60 deg/s; and the step in which the rate begins.
     for leg in (leg for each in plan.sorties for leg in each.legs if leg.kind == "spray"):
-        assert norths(leg)[0] >= 250.0 - 7.2 - 1.0
+        assert norths(leg)[0] >= 250.0 - 10.8 - 1.0
         assert norths(leg)[1] > 390.0
 
 
@@ -61,7 +62,7 @@ def test_a_narrow_bare_strip_is_flown_over_without_a_stop() -> None:
     # A leg of its own between two lines: hardly slower than at full speed.
     for leg in through:
         assert leg.through
-        assert leg.length_m / 6.0 < leg.seconds < leg.length_m / 6.0 + 1.0
+        assert leg.length_m / 6.0 - 1e-6 < leg.seconds < leg.length_m / 6.0 + 1.0
     assert plan.flight_s <= planned(Bare(0.0, 0.0)).flight_s + 1.0
 
 
