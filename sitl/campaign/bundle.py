@@ -10,6 +10,7 @@ import hashlib
 import os
 import platform
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -147,9 +148,20 @@ def unpack(bundle: Bundle, root: Path) -> Path:
 
 def keep(bundle: Bundle) -> Path:
     """Return the campaign's folder among files that are there until this process ends."""
-    root = Path(tempfile.mkdtemp(prefix="vrspray-campaign-"))
+    root = Path(tempfile.mkdtemp(prefix="vrspray-campaign-", dir=_own_folder()))
     atexit.register(shutil.rmtree, root, ignore_errors=True)
     return _unpacked.setdefault(bundle.sha256, unpack(bundle, root))
+
+
+def _own_folder() -> str | None:
+    """Return a Dask worker's own folder, which its cluster clears after a kill; None elsewhere."""
+    distributed = sys.modules.get("distributed")
+    if distributed is None:
+        return None
+    try:
+        return str(distributed.get_worker().local_directory)
+    except ValueError:
+        return None
 
 
 # ------------------------------------------------------------------------------ what flew, exactly

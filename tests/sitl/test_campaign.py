@@ -259,7 +259,11 @@ def test_a_real_dask_cluster_gives_the_same_rows_though_a_worker_is_killed(
 ) -> None:
     """A scheduler and two workers as processes, none of which has the campaign's files."""
     dask, told = [sys.executable, "-m", "dask"], tmp_path / "scheduler.json"
-    common: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    (left := tmp_path / "left").mkdir()
+    own = os.environ | {"TMPDIR": str(left), "DASK_TEMPORARY_DIRECTORY": str(tmp_path)}
+    common: dict[str, Any] = {
+        "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": own,
+    }  # fmt: skip
     worker = [*dask, "worker", "--scheduler-file", str(told), "--nthreads", "1", "--no-nanny",
               "--dashboard-address", "127.0.0.1:0", "--host", "127.0.0.1",
               "--local-directory"]  # fmt: skip
@@ -291,6 +295,8 @@ def test_a_real_dask_cluster_gives_the_same_rows_though_a_worker_is_killed(
     assert flown.returncode == 0, flown.stderr
     found = json.loads(flown.stdout)
     assert (found["workers"], found["lost_workers"]) == (2, 1)
+    # A worker that is killed clears nothing itself: its files lie where its cluster does.
+    assert not list(left.glob("vrspray-*"))
     assert files_of(tmp_path / "out") == files_of(reference)
 
 
