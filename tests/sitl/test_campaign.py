@@ -146,9 +146,10 @@ def test_a_campaign_whose_scheduler_is_killed_goes_on_to_the_same_bytes(
     script, out = tmp_path / "dies.py", tmp_path / "out"
     script.write_text(DIES)
     given = [sys.executable, str(script), str(here), str(out)]
-    root = str(Path(__file__).parents[2])
+    # What is killed leaves its temporary files: here.
+    own = {"PYTHONPATH": str(Path(__file__).parents[2]), "TMPDIR": str(tmp_path)}
     # Its workers hold its output open: that it ends says that they have ended.
-    ended = subprocess.run(given, env=os.environ | {"PYTHONPATH": root}, capture_output=True)
+    ended = subprocess.run(given, env=os.environ | own, capture_output=True)
     assert ended.returncode == -signal.SIGKILL, ended.stderr.decode()
     parts = len(rows_of(out)) // part_size(24)
     assert 0 < parts < 3
