@@ -364,6 +364,9 @@ Turn = Literal["stop", "strafe", "rounded"]
 # Passes so long, in accelerations, reach their speed; ways aside between them are tabled so far.
 LONG, ASIDE_KNOTS_M = 10.0, np.geomspace(0.05, 20_000.0, 160)
 SQUARE_DEG = 90.0
+# From one pass to the next, and from a ferry into a pass, the nose turns by this much or less; and
+# how fast it looks along the way again: ATC_SLEW_YAW of ArduCopter, MPC_YAWRAUTO_MAX of PX4.
+NOSE_DEG, NOSE_DEG_S = 180.0, 60.0
 # Shorter passes are left before the corner before them is done; ways aside as short as passes are.
 SHORT_KNOTS_M = np.array([0.5, 1.5, 3.0, 5.0, 8.0, 12.0, 18.0, 28.0, 45.0])
 BESIDE_KNOTS_M = np.array([0.5, 2.0, 4.0, 6.0, 9.0, 13.0, 20.0, 35.0, 60.0])

@@ -26,7 +26,6 @@ Ints = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
 # Times by the root of the way, to this length; longer ways are flown at speed.
 TABLED_M, KNOTS = 400.0, 1600
-NOSE_DEG = 180.0
 TOUCH_M = 1e-3
 # Neighbouring passes see each other. No way through: far apart, whatever the ferry around costs.
 SEEN_M = 9.0

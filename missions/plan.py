@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from companion.core.frame import LocalFrame
-from missions.corners import CornerRule, Motion, Turn
+from missions.corners import NOSE_DEG, NOSE_DEG_S, CornerRule, Motion, Turn
 from missions.coverage import Coverage
 from missions.energy import J_WH, STRAIGHT_DEG, VERTICALS, Battery, Vertical
 from missions.field import Field
@@ -21,14 +21,11 @@ from missions.terrain import Terrain
 Place = tuple[float, float]
 Kind = Literal["spray", "transit", "ferry"]
 
-# WPNAV_JERK of ArduCopter, MPC_JERK_AUTO of PX4, as they come.
 # A plan covers 99.8 % of what a strip can reach, simpler borders counted, where nothing else is
 # allowed.
 LEAVE_PERCENT = 0.2
+# WPNAV_JERK of ArduCopter, MPC_JERK_AUTO of PX4, as they come.
 JERKS_M_S3 = {"ardupilot": 1.0, "px4": 4.0}
-# How fast the nose looks along the way again, by ATC_SLEW_YAW of ArduCopter, MPC_YAWRAUTO_MAX of
-# PX4; the most that it has to.
-NOSE_DEG_S, HALF_TURN_DEG = 60.0, 180.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,7 +110,7 @@ class Settings:
         """
         gaining_s, turning_s = self.speed_m_s / self.acceleration_m_s2, 0.0
         if self.turn != "strafe":
-            turning_s = HALF_TURN_DEG / (self.nose_rate_deg_s or NOSE_DEG_S)
+            turning_s = NOSE_DEG / (self.nose_rate_deg_s or NOSE_DEG_S)
         return self.speed_m_s * (gaining_s / 2.0 + max(turning_s - gaining_s, 0.0))
 
     @property

@@ -13,9 +13,9 @@ from itertools import chain, pairwise
 
 import numpy as np
 
-from missions.corners import Motion
+from missions.corners import NOSE_DEG, Motion
 from missions.demand import Demand
-from missions.passes import NOSE_DEG, TOUCH_M, Part, Passes, Place, Times, joined_parts, turned
+from missions.passes import TOUCH_M, Part, Passes, Place, Times, joined_parts, turned
 from missions.plan import Settings
 from missions.refills import STUB_M, Limits, flown_by, plainly, split
 from missions.searching import steps

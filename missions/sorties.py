@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 import shapely
 
-from missions.corners import Motion
+from missions.corners import NOSE_DEG, Motion
 from missions.demand import Demand, Pieces, cut
 from missions.energy import J_WH, KG_L, Battery, Vertical
 from missions.errors import OutOfReachError, PlanError
@@ -499,9 +499,6 @@ def _is_straight(first: _Run, second: _Run) -> bool:
 
 
 # Whether a battery lasts for a sortie while its pieces are still being moved about.
-
-# From one pass to the next, and from a ferry into a pass, the nose turns by this much or less.
-NOSE_DEG = 180.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

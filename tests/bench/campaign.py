@@ -190,7 +190,8 @@ def page(found: dict[str, Any], log: dict[str, Any] | None, command: str) -> str
     of = log or found
     rate = of["flights_per_cpu_s"]
     lines = [
-        "<!-- Written by `python -m tests.bench.campaign --page`; do not edit. -->\n",
+        "<!-- Written by `python -m tests.bench.campaign --page` down to Journals; do not edit that"
+        " part. -->\n",
         "# Scale\n",
         "What one core does, where the limits are, and what a million flights cost. *Measured* is",
         "marked apart from *computed*.\n",
