@@ -185,6 +185,7 @@ async def test_whatever_is_lost_closes_all_valves(ending: str) -> None:
     assert all(order.pulse_us == 1000 for order in peer.orders[-6:])
 
 
+@pytest.mark.on_time
 async def test_on_own_lines_each_valve_clicks_twice_for_a_fifth_of_a_second(tmp_path: Path) -> None:
     setup, port = builders.setup(), free_port()
     link = VehicleLink(f"udpin:127.0.0.1:{port}", ComponentOptions(watch_mission=True))
