@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -35,8 +35,8 @@ from missions.pilot_sheet import (
 )
 from missions.plan import LEAVE_PERCENT, Plan
 from missions.planner import plan_mission
-from missions.prices import closing_hint, lines_warnings, overlap_warnings, prices
-from missions.reading import Asked, assumed, names_of, read_task
+from missions.prices import Price, closing_hint, lines_warnings, overlap_warnings, prices
+from missions.reading import Asked, Task, assumed, names_of, read_task
 from missions.reading_fleet import BreakAsked
 from missions.reading_ground import Autopilot, GroundAsked, label_warnings, parse_run_in, parse_wind
 from missions.reading_outline import CORRIDOR_MAX_M, RADIUS_MAX_M
@@ -284,10 +284,10 @@ def plan(
         settings=with_tank(planned.settings, in_tank_l),
     )
     took_s = perf_counter() - start
-    choices = []
+    choices: list[tuple[Price, str]] = []
     asks = choices_too or overlap_max is not None or leave_max > LEAVE_PERCENT
     if asks and task.left is None and not isinstance(task.rates, UntreatedRates):
-        choices = list(prices(planned, task.rates, depots=task.depots, around=task.around))
+        choices = _priced(planned, task, is_stopped=watch.stopped)
     goes_on = resume is not None or done is not None
     mix = mix_of(reading.config, planned, task.rates, goes_on=goes_on)
     with _undisturbed():
@@ -360,6 +360,18 @@ def _stoppable(tell: Tell) -> Iterator[Watch]:
             yield watch
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def _priced(planned: Plan, task: Task, *, is_stopped: bool) -> list[tuple[Price, str]]:
+    """Return the other choices; a search that was stopped, or is now, has no more of them."""
+    found: list[tuple[Price, str]] = []
+    with suppress(KeyboardInterrupt), progress(after_s=BAR_AFTER_S) as tell:
+        with watched(Watch(tell=tell)):
+            others = prices(planned, task.rates, depots=task.depots, around=task.around)
+            found.extend(() if is_stopped else others)
+        return found
+    note("stopped: not all choices are shown")
+    return found
 
 
 @contextmanager

@@ -29,6 +29,7 @@ from missions.open_lines import (
     open_lines,
 )
 from missions.plan import LEAVE_PERCENT, Settings
+from missions.searching import is_stopped, lines_are_drawn
 from missions.selection import Aim, chosen, families
 from missions.strips import (
     Bools,
@@ -157,6 +158,8 @@ class _Covering:
                     covered=self.boom.united(lines),
                 )  # fmt: skip
                 lines = joined([lines, more])
+            if is_stopped():
+                return
             if not len(lines):
                 continue
             tour = self.tour(lines)
@@ -200,6 +203,7 @@ def spray_lines(field: Field, settings: Settings, motion: Motion) -> tuple[Float
     few = spare if leaves else min(LEFT_SHARE, spare / 2.0)
     boom = boom_of(settings, field)
     drawn = _layouts(field, settings, motion, inner, angles[:ANGLES_TRIED], boom, left_share=few)
+    lines_are_drawn()
     if max(len(lines) for _, lines in drawn) > LINES_MAX:
         costs = [_layout_s(lines, field, settings, motion) for _, lines in drawn]
         angle_deg, lines = drawn[costs.index(min(costs))]

@@ -29,7 +29,7 @@ from missions.layouts import covers_first, crowded, flyable, is_small, spray_lin
 from missions.paced import Paced, in_room, range_warnings, room_warnings
 from missions.plan import Leg, Plan, Settings, Sortie, flown_lines, nose_s, sortie_wh
 from missions.remaining import Remaining, UntreatedRates, demands_once
-from missions.searching import lines_are_drawn
+from missions.searching import is_stopped, lines_are_drawn
 from missions.sheet import overlap_by_sortie_l, scheduled
 from missions.sorties import Flying, SortieSearch
 from missions.spacing import Spacing
@@ -112,8 +112,10 @@ def _within_overlap(planned: Callable[[Settings], Plan], settings: Settings) -> 
     for _ in range(OVERLAP_TRIES):
         plan = planned(replace(settings, overlap_max_percent=aimed))
         twice = sum(overlap_by_sortie_l(plan).values())
+        is_known = any(np.array_equal(plan.lines, other.lines) for _, _, other in found)
         found.append((100.0 * twice / plan.volume_l, len(found), plan))
-        if found[-1][0] <= cap:
+        # A cap that changes no line will not change any when it is lower, or hardly.
+        if found[-1][0] <= cap or is_known or is_stopped():
             break
         aimed *= OVERLAP_LESS * cap / found[-1][0]
     _, _, best = min(found, key=lambda each: each[:2])

@@ -48,6 +48,12 @@ def lines_are_drawn() -> None:
         watch.has_lines = True
 
 
+def is_stopped() -> bool:
+    """Return whether a search that has found something is to end with it."""
+    watch = _WATCH.get()
+    return watch is not None and watch.stopped
+
+
 def steps(what: str, count: int) -> Iterator[int]:
     """Yield the steps of a search, until it is stopped.
 

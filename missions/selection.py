@@ -22,7 +22,7 @@ from missions.boom import SLACK_M, Boom, where_inside
 from missions.corners import Motion
 from missions.coverage import reachable
 from missions.open_lines import edges_along, evenly
-from missions.searching import below
+from missions.searching import below, steps
 from missions.strips import Floats, axes, directions, joined, lengths_m
 
 # The ground is looked at in so many points, one for 2.5 m2 of a hectare.
@@ -278,7 +278,7 @@ class _Set:
         best, best_s = list(self._taken), self.value_s()
         now_s, heat = best_s, HOT_S
         cooling = (COLD_S / HOT_S) ** (1.0 / moves)
-        for _ in range(moves):
+        for _ in steps("choice of lines", moves):
             heat *= cooling
             counts = (list(self._digits), self._treated, self._bare, self._doubled)
             changed = self._move(draw)

@@ -9,7 +9,7 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import pytest
 import shapely
@@ -18,8 +18,10 @@ from shapely import box
 import missions.cli
 import missions.planner
 import missions.search
+import missions.selection
 from companion.cli import app
-from missions.plan import Settings
+from missions.field import Field
+from missions.plan import Plan, Settings
 from missions.searching import Watch, lines_are_drawn, steps, watched
 from tests.mission_fields import degrees
 
@@ -60,6 +62,18 @@ def test_ctrl_c_before_there_are_lines_writes_nothing(
     assert capsys.readouterr().err == "interrupted\n"
 
 
+def pressing(*presses: int) -> Callable[[str, int], Iterator[int]]:
+    """Return the steps of a search, at some of which Ctrl-C is pressed."""
+
+    def pressed_steps(what: str, count: int) -> Iterator[int]:
+        for step in steps(what, count):
+            if step in presses:
+                press_ctrl_c()
+            yield step
+
+    return pressed_steps
+
+
 def pressed_at(monkeypatch: pytest.MonkeyPatch, *presses: int) -> list[int]:
     """Have Ctrl-C pressed at these steps of the search; return the list of those it does."""
     done: list[int] = []
@@ -98,6 +112,89 @@ def test_a_second_ctrl_c_ends_the_command(
     assert code == app.INTERRUPTED
     assert not out.exists()
     assert capsys.readouterr().err == "interrupted\n"
+
+
+SMALL = box(0.0, 0.0, 60.0, 41.0).union(box(0.0, 30.0, 25.0, 60.0))
+
+
+def plan_small(folder: Path, *given: str) -> tuple[int, Path]:
+    """Run the command on a corner of 0.3 ha, whose lines are chosen from all that could be."""
+    field, out = folder / "field.geojson", folder / "out.geojson"
+    field.write_text(shapely.to_geojson(degrees(SMALL)), encoding="utf-8")
+    asked = ["--swath-m", "6", "--speed-m-s", "6", "--rate-l-ha", "20", "--json", *given]
+    return app.execute(["plan", "--force", str(field), "--out", str(out), *asked]), out
+
+
+def plans_made(monkeypatch: pytest.MonkeyPatch, *, press_in: int | None = None) -> list[Settings]:
+    """Return what plans are made for, as they are; with a Ctrl-C as that one begins."""
+    made: list[Settings] = []
+    before = missions.planner._planned
+
+    def planned(field: Field, settings: Settings, **given: Any) -> Plan:
+        made.append(settings)
+        if len(made) == press_in:
+            press_ctrl_c()
+        return before(field, settings, **given)
+
+    monkeypatch.setattr(missions.planner, "_planned", planned)
+    return made
+
+
+def test_ctrl_c_while_lines_are_chosen_writes_a_plan(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole, _ = plan_small(tmp_path)
+    usual = json.loads(capsys.readouterr().out)
+    monkeypatch.setattr(missions.selection, "steps", pressing(100))
+    code, out = plan_small(tmp_path)
+    said = capsys.readouterr()
+    found = json.loads(said.out)
+    assert (whole, code, found["stopped"]) == (0, 0, True)
+    assert said.err.splitlines()[-1].endswith(SAID)
+    assert out.exists()
+    assert found["reachable_percent"] >= 99.8
+    assert found["flight_s"] >= usual["flight_s"]
+
+
+def test_ctrl_c_while_less_overlap_is_looked_for_keeps_the_least_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    undisturbed = plans_made(monkeypatch)
+    plan_small(tmp_path, "--overlap-max", "0")
+    capsys.readouterr()
+    # Two of them are the other choices.
+    assert len(undisturbed) > 4
+    monkeypatch.undo()
+    made = plans_made(monkeypatch, press_in=2)
+    code, out = plan_small(tmp_path, "--overlap-max", "0")
+    said = capsys.readouterr()
+    assert (code, len(made)) == (0, 2)
+    assert SAID in said.err
+    assert out.exists()
+    assert not json.loads(said.out)["prices"]
+
+
+def test_ctrl_c_while_choices_are_looked_for_keeps_the_plan(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = plans_made(monkeypatch, press_in=2)
+    code, out = plan_small(tmp_path, "--choices")
+    said = capsys.readouterr()
+    assert (code, len(made)) == (0, 2)
+    assert json.loads(said.out)["stopped"] is False
+    assert "stopped: not all choices are shown" in said.err
+    assert out.exists()
+
+
+def test_a_cap_that_changes_no_line_is_not_lowered_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = plans_made(monkeypatch)
+    # All ground is to be covered but 1 %, whatever falls twice.
+    plan_small(tmp_path, "--overlap-max", "0.1", "--leave-max", "1", "--effort", "quick")
+    capsys.readouterr()
+    asked = [each for each in made if each.leave_max_percent == 1.0]
+    assert [each.overlap_max_percent is None for each in asked] == [False, False, True]
 
 
 def test_an_undisturbed_plan_says_nothing_of_it(
