@@ -35,7 +35,7 @@ from missions.pilot_sheet import (
 )
 from missions.plan import LEAVE_PERCENT, Plan
 from missions.planner import plan_mission
-from missions.prices import Price, closing_hint, lines_warnings, overlap_warnings, prices
+from missions.prices import Price, lines_warnings, overlap_warnings, prices, twice_hint
 from missions.reading import Asked, Task, assumed, names_of, read_task
 from missions.reading_fleet import BreakAsked
 from missions.reading_ground import Autopilot, GroundAsked, label_warnings, parse_run_in, parse_wind
@@ -452,8 +452,8 @@ def _check_outputs(
 
 
 def _choices(planned: Plan, result: dict[str, Any], prices: list[str], *, asked: bool) -> list[str]:
-    """Return the other choices with their prices; where none was asked for, what costs nothing."""
-    return prices if asked else list(closing_hint(planned, result["overlap_litres_percent"]))
+    """Return the other choices with their prices; where none was asked for, a hint at them."""
+    return prices if asked else list(twice_hint(planned, result["overlap_litres_percent"]))
 
 
 def _once(planned: Plan) -> str:

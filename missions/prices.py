@@ -88,15 +88,19 @@ def lines_warnings(plan: Plan, config: Config | None) -> tuple[str, ...]:
     )
 
 
-def closing_hint(plan: Plan, overlap_litres_percent: float) -> tuple[str, ...]:
-    """Return what spares litres that fall twice and costs nothing, where it is not taken."""
+def twice_hint(plan: Plan, overlap_litres_percent: float) -> tuple[str, ...]:
+    """Return what spares litres that fall twice, where that is worth a word and nothing does."""
     settings = plan.settings
-    closes = settings.switch_off_percent is not None or not settings.valves
-    if closes or not overlap_litres_percent > OVERLAP_MAX_PERCENT:
+    if not overlap_litres_percent > OVERLAP_MAX_PERCENT:
+        return ()
+    twice = f"{overlap_litres_percent:.1f} % of the litres fall twice"
+    if not settings.valves and is_small(plan.field, settings):
+        return (f"{twice}: --choices shows what fewer passes would leave, and save",)
+    if not settings.valves or settings.switch_off_percent is not None:
         return ()
     return (
-        f"{overlap_litres_percent:.1f} % of the litres fall twice: coverage.switch_off_percent = "
-        "100 has the companion close valves over treated ground, and the plan count on it",
+        f"{twice}: coverage.switch_off_percent = 100 has the companion close valves over treated "
+        "ground, and the plan count on it",
     )
 
 

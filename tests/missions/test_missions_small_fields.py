@@ -28,7 +28,7 @@ from missions.open_lines import open_lines
 from missions.picture import draw_plan
 from missions.plan import Leg, Plan, Settings
 from missions.planner import plan_mission
-from missions.prices import closing_hint, overlap_warnings
+from missions.prices import overlap_warnings, twice_hint
 from missions.selection import Aim, _Set, chosen, families
 from missions.sheet import sheet
 from missions.strips import border_passes, joined, lengths_m, rectangles, united, whole
@@ -183,9 +183,12 @@ def test_one_valve_is_the_floor_of_overlap_on_a_ditch() -> None:
     assert closing.volume_l == pytest.approx(8.0 * 90.0 * 20.0 / 1e4, rel=0.01)
     assert len(closing.lines) == len(open_.lines) == 2
     # What spares them is said where it is not taken, and where there is something to spare.
-    hints = [closing_hint(each, sheet(each)["overlap_litres_percent"]) for each in (open_, closing)]
+    hints = [twice_hint(each, sheet(each)["overlap_litres_percent"]) for each in (open_, closing)]
     assert "coverage.switch_off_percent = 100" in hints[0][0] and not hints[1]
-    assert not closing_hint(open_, 4.9)
+    assert not twice_hint(open_, 4.9)
+    # A boom that is one valve has its passes to choose.
+    (hint,) = twice_hint(plan_of(ditch), 36.7)
+    assert "--choices shows" in hint
 
 
 @pytest.mark.parametrize(
