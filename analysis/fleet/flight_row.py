@@ -50,7 +50,7 @@ _M2_PER_HA = 10_000.0
 _PIECE_BYTES = 1 << 20
 _FAULT = "fault-"
 # What a file that is a stranger's says, and one of ours that lost its beginning as well.
-_NO_JOURNAL = "is not a journal"
+_NO_JOURNAL = "this is not a journal"
 _SQLITE = b"SQLite format 3\0"
 
 

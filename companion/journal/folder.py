@@ -431,7 +431,7 @@ def _looked_at(path: Path) -> tuple[bool, _Ending | None]:
     """
     with read_only(path, timeout_s=0.0) as connection:
         if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:
-            raise ValueError("is not a journal")
+            raise ValueError("this is not a journal")
         check_programs(connection, writes=True)
         (page_bytes,) = connection.execute("PRAGMA page_size").fetchone()
         if path.stat().st_size % page_bytes:

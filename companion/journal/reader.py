@@ -61,7 +61,7 @@ def refused(path: Path, error: Exception) -> JournalError:
     if isinstance(error, PermissionError):
         return JournalError(f"{path}: cannot be read: {text}")
     if isinstance(error, sqlite3.DatabaseError) and "not a database" in text:
-        return JournalError(f"{path}: is not a journal; {_GIVE}")
+        return JournalError(f"{path}: this is not a journal; {_GIVE}")
     return UnreadableError(f"{path}: is damaged: {text}")
 
 
@@ -74,9 +74,9 @@ def no_file(path: Path) -> JournalError:
 def check_kind(name: object, tables: Collection[str], *, is_geopackage: bool) -> None:
     """Refuse what is no journal by its tables: another database, another GeoPackage."""
     if not is_geopackage:
-        raise JournalError(f"{name}: is not a journal; {_GIVE}")
+        raise JournalError(f"{name}: this is not a journal; {_GIVE}")
     if len(_OWN.intersection(tables)) < _SOME:
-        raise JournalError(f"{name}: is a GeoPackage, but no journal of a flight")
+        raise JournalError(f"{name}: this is a GeoPackage, but no journal of a flight")
 
 
 def why_no_setup(error: Exception) -> str:

@@ -225,7 +225,9 @@ def test_damaged_journals_are_listed_and_the_others_are_in(
     fleet = str(tmp_path / "fleet")
     arguments = ["fleet", "add", str(several[0]), str(bad), str(nothing), "--into", fleet, "--json"]
     assert execute(arguments) == 1
-    found = json.loads(capsys.readouterr().out)
+    said = capsys.readouterr()
+    assert f"not added: {nothing}: this is not a journal; give the .gpkg file" in said.err
+    found = json.loads(said.out)
     assert found["added"] == 1
     assert {Path(each["file"]).name: each["is_damaged"] for each in found["problems"]} == {
         "flight-0009.gpkg": True, "flight-0010.gpkg": False,

@@ -146,8 +146,8 @@ def test_a_damaged_journal_is_reported_as_far_as_it_goes_and_exit_1(
     ("arguments", "text"),
     [
         (["{folder}/none.gpkg"], "there is no such file"),
-        (["{folder}/text.gpkg"], "is not a journal"),
-        (["{folder}/other.gpkg"], "is not a journal"),
+        (["{folder}/text.gpkg"], "this is not a journal"),
+        (["{folder}/other.gpkg"], "this is not a journal"),
         (["{flown}", "--time-zone", "Mars/Base"], "time zone Mars/Base: not known"),
         (["{flown}", "--set", "application.crop_eppo=wheat"], "application.crop_eppo"),
         (["{flown}", "--application", "{folder}/none.toml"], "none.toml: no such file"),

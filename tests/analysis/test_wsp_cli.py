@@ -137,7 +137,7 @@ def test_a_journal_is_looked_at_before_the_scans(
     code, found, _ = run(capsys, scan, *options)
     assert code == 1
     assert len(found["cards"]) == 2
-    assert "is not a journal" in found["warnings"][0]
+    assert "this is not a journal" in found["warnings"][0]
 
 
 def test_a_flight_that_was_cut_is_a_warning(

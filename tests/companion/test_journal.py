@@ -492,15 +492,18 @@ def garble(path: Path) -> None:
 
 BROKEN = {
     "missing": (Path.unlink, "there is no such file"),
-    "empty": (lambda path: os.truncate(path, 0), "is not a journal"),
-    "text": (lambda path: path.write_text("x" * 200), "is not a journal"),
+    "empty": (lambda path: os.truncate(path, 0), "this is not a journal"),
+    "text": (lambda path: path.write_text("x" * 200), "this is not a journal"),
     "cut": (cut, "is damaged"),
     "garbled": (garble, "is damaged"),
     "version": (
         lambda path: change(path, "UPDATE meta SET value = '9' WHERE key = 'journal_version'"),
         "journal of version 9, this program reads versions 1 and 2",
     ),
-    "other database": (lambda path: change(path, "PRAGMA application_id = 5"), "is not a journal"),
+    "other database": (
+        lambda path: change(path, "PRAGMA application_id = 5"),
+        "this is not a journal",
+    ),
     "no blocks": (lambda path: change(path, "DROP TABLE blocks"), "the table blocks is missing"),
     "set-up": (
         lambda path: change(path, "UPDATE meta SET value = '{}' WHERE key = 'setup'"),

@@ -89,12 +89,12 @@ SETUP = "UPDATE meta SET value = {} WHERE key = 'setup'"
 NO_JOURNAL: dict[str, tuple[Damage, str]] = {
     "no file": (Path.unlink, "there is no such file; give the .gpkg file of a flight"),
     "a folder": (as_folder, "is a folder; give the .gpkg file of a flight"),
-    "a text": (lambda path: path.write_text("a text\n" * 99), "is not a journal"),
-    "empty": (lambda path: path.write_bytes(b""), "is not a journal"),
-    "other database": (other_database("CREATE TABLE meta (key, value)"), "is not a journal"),
+    "a text": (lambda path: path.write_text("a text\n" * 99), "this is not a journal"),
+    "empty": (lambda path: path.write_bytes(b""), "this is not a journal"),
+    "other database": (other_database("CREATE TABLE meta (key, value)"), "this is not a journal"),
     "other geopackage": (
         other_database("PRAGMA application_id = 1196444487", "CREATE TABLE zones (geom)"),
-        "is a GeoPackage, but no journal of a flight",
+        "this is a GeoPackage, but no journal of a flight",
     ),
 }
 DAMAGED: dict[str, tuple[Damage, str]] = {
