@@ -315,7 +315,10 @@ def plan(
             planned, result, pilot_sheet, title=field.stem, product=product_of(reading.config),
             start_min=parse_start(first), picture=png,
         )  # fmt: skip
-    warnings = (*warnings, *overlap_warnings(planned, result["overlap_litres_percent"]))
+    warnings = (
+        *warnings,
+        *overlap_warnings(planned, result["overlap_litres_percent"], is_stopped=watch.stopped),
+    )
     result["warnings"] = list(warnings)
     said = _choices(planned, result, [text for _, text in choices], asked=asks or sprayer)
     answer(

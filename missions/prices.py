@@ -55,12 +55,19 @@ def prices(
             yield price, _words(price, now)
 
 
-def overlap_warnings(plan: Plan, overlap_litres_percent: float) -> tuple[str, ...]:
+def overlap_warnings(
+    plan: Plan, overlap_litres_percent: float, *, is_stopped: bool = False
+) -> tuple[str, ...]:
     """Return that more is sprayed twice than was asked for, where it is."""
     cap = plan.settings.overlap_max_percent
     if cap is None or overlap_litres_percent <= cap:
         return ()
     closing = plan.settings.switch_off_percent is None
+    if is_stopped:
+        return (
+            f"{overlap_litres_percent:.1f} % of the litres are sprayed twice, above "
+            f"--overlap-max {cap:g}: the search was stopped before it found less",
+        )
     least = ", the least found for this field" if is_small(plan.field, plan.settings) else ""
     return (
         f"{overlap_litres_percent:.1f} % of the litres are sprayed twice{least}, above "

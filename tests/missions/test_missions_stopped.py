@@ -169,6 +169,7 @@ def test_ctrl_c_while_less_overlap_is_looked_for_keeps_the_least_found(
     code, out = plan_small(tmp_path, "--overlap-max", "0")
     said = capsys.readouterr()
     assert (code, len(made)) == (0, 2)
+    assert "above --overlap-max 0: the search was stopped before it found less" in said.err
     assert SAID in said.err
     assert out.exists()
     assert not json.loads(said.out)["prices"]
