@@ -21,7 +21,7 @@ from missions.reading_fleet import battery_of
 from missions.ways import build_ways
 from tests.missions.test_missions_plan import field_of, plan_of
 
-pytestmark = pytest.mark.usefixtures("searched_briefly")
+pytestmark = pytest.mark.usefixtures("searched_briefly", "laid_out_once")
 
 DRAWN = Battery(hover_w=4000.0, cruise_w=3500.0, per_kg_w=60.0)
 

@@ -19,7 +19,7 @@ from missions.planner import plan_mission
 from missions.strips import Floats, lengths_m
 from tests.missions.test_missions_plan import FRAME, field_of
 
-pytestmark = pytest.mark.usefixtures("searched_briefly")
+pytestmark = pytest.mark.usefixtures("searched_briefly", "laid_out_once")
 
 SETTINGS = Settings(
     swath_width_m=6.0, speed_m_s=6.0, reserve_l=1.0, tank_l=40.0, moves=400,

@@ -23,7 +23,7 @@ from tests.bench.small_fields import VALVES
 from tests.mission_fields import degrees
 from tests.small_fields import DITCH_M, made_up
 
-pytestmark = pytest.mark.usefixtures("searched_briefly")
+pytestmark = pytest.mark.usefixtures("searched_briefly", "laid_out_once")
 
 WIDTH_M = 6.0
 PLACES = np.array(VALVES)

@@ -19,7 +19,7 @@ from missions.strips import rectangles
 from tests.bench.missions import comb, outside_m2, transit_outside_m
 from tests.missions.test_missions_plan import WIDTH_M, plan_of
 
-pytestmark = pytest.mark.usefixtures("searched_briefly")
+pytestmark = pytest.mark.usefixtures("searched_briefly", "laid_out_once")
 
 FIELD = box(0.0, 0.0, 240.0, 200.0)
 

@@ -17,7 +17,7 @@ from missions.planner import plan_mission
 from missions.sheet import sheet, sortie_lines
 from tests.bench.missions import FRAME, to_degrees
 
-pytestmark = pytest.mark.usefixtures("searched_briefly")
+pytestmark = pytest.mark.usefixtures("searched_briefly", "laid_out_once")
 
 
 def planned(*, tank_l: float = 400.0, depot_m: tuple[float, float] | None = None) -> Plan:

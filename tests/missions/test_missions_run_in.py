@@ -25,7 +25,7 @@ from tests.bench.missions import FRAME, to_degrees
 from tests.missions.test_missions_cli import ANYANG, run, written
 from tests.missions.test_missions_wind import config_with
 
-pytestmark = pytest.mark.usefixtures("searched_briefly")
+pytestmark = pytest.mark.usefixtures("searched_briefly", "laid_out_once")
 
 GROUND = box(0, 0, 60, 200)
 # A jerk of 1 m/s3 up and down again, 0.3 s of its own coming and going; half of 6 m/s meanwhile.

@@ -20,6 +20,8 @@ from missions.planner import plan_mission
 from missions.strips import Floats, rectangles
 from tests.bench.missions import FRAME, to_degrees
 
+pytestmark = pytest.mark.usefixtures("laid_out_once")
+
 
 @dataclass(frozen=True)
 class Bare:
