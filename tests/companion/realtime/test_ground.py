@@ -26,6 +26,7 @@ from tests.companion.wire_peer import WirePeer, free_port, over_udp
 pytestmark = pytest.mark.sitl
 
 
+@pytest.mark.on_time
 async def test_a_held_space_bar_primes_and_ends_by_itself(tmp_path: Path) -> None:
     config = example(tmp_path)
     async with session(config, "prime", "--seconds", "2", "--water") as work:
@@ -69,6 +70,7 @@ async def test_letting_go_closes_and_so_does_ctrl_c(tmp_path: Path, ending: str,
     assert result == {"error": "interrupted"} if code else result["reasons"] == ["another-key"]
 
 
+@pytest.mark.on_time
 async def test_lines_of_a_script_catch_for_an_exact_time(tmp_path: Path) -> None:
     arguments = ("catch", "--duty", "0.5", "--seconds", "1.5", "--valve", "2", "--valve", "3")
     async with session(example(tmp_path), *arguments, by_lines=True) as work:
