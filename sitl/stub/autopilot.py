@@ -12,7 +12,8 @@ from collections.abc import Callable, Sequence
 from itertools import count
 from typing import Protocol
 
-from sitl.stub import actions, commands
+from sitl.stub import commands
+from sitl.stub.ardupilot import write_servo
 from sitl.stub.faults import Fault, FaultClock, FaultKind, rc_pulses_us
 from sitl.stub.firmware import Parts, Upload
 from sitl.stub.mission_items import AUTO, INFO, MissionItem
@@ -27,6 +28,7 @@ from sitl.stub.protocol import (
     sender,
     target,
 )
+from sitl.stub.px4 import set_actuators
 from sitl.stub.sprayer import Battery
 from sitl.stub.streams import Strangers
 from sitl.stub.world import Pose
@@ -105,7 +107,7 @@ class Autopilot:
             handler = self.firmware.messages.get(message.get_type())
             if handler is not None and is_for_us(self, message):
                 handler(self, channel, message, now_s)
-        actions.tell(self, now_s)
+        self._tell_events(now_s)
 
     # ------------------------------------------------------------------------------ speech
 
@@ -235,7 +237,7 @@ class Autopilot:
         self._incidents.tick(self, now_s)
         if self.queue is not None:
             self.queue.run(now_s)
-        actions.tell(self, now_s)
+        self._tell_events(now_s)
         self._update_outputs(now_s)
         self._run_script(now_s)
         commands.tick(self, now_s)
@@ -253,6 +255,27 @@ class Autopilot:
         if self.script is not None:
             due_s.append(self._script_due_s)
         return min(due_s + [channel.next_due_s() for channel in self.channels])
+
+    def _tell_events(self, now_s: float) -> None:
+        """Send what has happened since the last call, and do the mission's actions."""
+        for event in self.flight.events:
+            if event.text and (event.action is None or self.firmware.tells_of_actions):
+                self.tell(event.text, severity=event.severity)
+            if event.reached is not None:
+                number = self.wire_sequence(event.reached)
+                self.broadcast(dialect.MAVLink_mission_item_reached_message(number))
+            if event.action is not None:
+                self._do(event.action, now_s)
+        self.flight.events.clear()
+
+    def _do(self, item: MissionItem, now_s: float) -> None:
+        if item.command == dialect.MAV_CMD_DO_SET_SERVO:
+            write_servo(self, item.param1, item.param2, now_s)
+        if item.command == dialect.MAV_CMD_DO_SET_ACTUATOR:
+            # The fifth and sixth are whole numbers on the wire, for degrees of 1e-7 (PX4 #28723).
+            last = (item.x_e7 * 1e-7, item.y_e7 * 1e-7, item.z_m)
+            params = (item.param1, item.param2, item.param3, item.param4, *last)
+            set_actuators(self, params, now_s)
 
     def _stream_defaults(self, channel: Channel, now_s: float) -> None:
         for message_id, rate_hz in self.firmware.default_rates_hz.items():
