@@ -286,8 +286,9 @@ def plan(
     took_s = perf_counter() - start
     choices: list[tuple[Price, str]] = []
     asks = choices_too or overlap_max is not None or leave_max > LEAVE_PERCENT
-    if asks and task.left is None and not isinstance(task.rates, UntreatedRates):
-        choices = _priced(planned, task, is_stopped=watch.stopped)
+    is_whole = task.left is None and not isinstance(task.rates, UntreatedRates)
+    if asks and is_whole and not watch.stopped:
+        choices = _priced(planned, task)
     goes_on = resume is not None or done is not None
     mix = mix_of(reading.config, planned, task.rates, goes_on=goes_on)
     with _undisturbed():
@@ -365,13 +366,12 @@ def _stoppable(tell: Tell) -> Iterator[Watch]:
         signal.signal(signal.SIGINT, before)
 
 
-def _priced(planned: Plan, task: Task, *, is_stopped: bool) -> list[tuple[Price, str]]:
-    """Return the other choices; a search that was stopped, or is now, has no more of them."""
+def _priced(planned: Plan, task: Task) -> list[tuple[Price, str]]:
+    """Return the other choices; Ctrl-C leaves out those that are not priced yet."""
     found: list[tuple[Price, str]] = []
     with suppress(KeyboardInterrupt), progress(after_s=BAR_AFTER_S) as tell:
         with watched(Watch(tell=tell)):
-            others = prices(planned, task.rates, depots=task.depots, around=task.around)
-            found.extend(() if is_stopped else others)
+            found.extend(prices(planned, task.rates, depots=task.depots, around=task.around))
         return found
     note("stopped: not all choices are shown")
     return found

@@ -152,14 +152,14 @@ class _Covering:
         pools.append((joined([best, passes, *some, *drawn[1:]]), list(range(len(best)))))
         worse = 0
         for lines in chosen(pools, ground, self.boom, motion=self.motion, aim=aim):
+            if is_stopped():
+                return
             if aim.covers_first:
                 more = patches(
                     lines, ground, width_m, left_share=self.left_share,
                     covered=self.boom.united(lines),
                 )  # fmt: skip
                 lines = joined([lines, more])
-            if is_stopped():
-                return
             if not len(lines):
                 continue
             tour = self.tour(lines)

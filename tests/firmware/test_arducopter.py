@@ -57,7 +57,6 @@ def holds(verdict: Verdict) -> None:
 
 
 @pytest.mark.short
-@pytest.mark.on_time
 def test_each_change_of_a_pass_at_5_m_s_falls_on_its_boundary(
     firmwares: Path, tmp_path: Path, tell: Callable[[object], None]
 ) -> None:

@@ -186,7 +186,6 @@ def holds(found: dict[str, Verdict], tell: Callable[[object], None]) -> Verdict:
 
 
 @pytest.mark.short
-@pytest.mark.on_time
 def test_each_change_falls_where_px4_believes_its_boundary(
     firmwares: Path, tmp_path: Path, tell: Callable[[object], None]
 ) -> None:

@@ -59,7 +59,6 @@ def folder(tmp_path: Path) -> Path:
     return home
 
 
-@pytest.mark.on_time
 async def test_the_companion_sprays_the_map_while_mavproxy_flies_its_mission(
     tmp_path: Path, folder: Path
 ) -> None:
@@ -78,7 +77,6 @@ async def test_the_companion_sprays_the_map_while_mavproxy_flies_its_mission(
     assert found["volume_l"] == pytest.approx(0.9 * prescribed_l(), rel=0.1)
 
 
-@pytest.mark.on_time
 async def test_mavproxy_reaches_both_through_a_router_and_px4_flies_its_mission(
     tmp_path: Path, folder: Path
 ) -> None:

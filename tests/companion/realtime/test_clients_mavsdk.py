@@ -194,7 +194,6 @@ async def fly(bench: Bench, station: Ground) -> None:
 
 
 @both
-@pytest.mark.on_time
 async def test_the_companion_sprays_the_map_while_mavsdk_flies_its_mission(
     autopilot: str, tmp_path: Path
 ) -> None:

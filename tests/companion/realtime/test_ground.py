@@ -26,7 +26,6 @@ from tests.companion.wire_peer import WirePeer, free_port, over_udp
 pytestmark = pytest.mark.sitl
 
 
-@pytest.mark.on_time
 async def test_a_held_space_bar_primes_and_ends_by_itself(tmp_path: Path) -> None:
     config = example(tmp_path)
     async with session(config, "prime", "--seconds", "2", "--water") as work:
@@ -70,7 +69,6 @@ async def test_letting_go_closes_and_so_does_ctrl_c(tmp_path: Path, ending: str,
     assert result == {"error": "interrupted"} if code else result["reasons"] == ["another-key"]
 
 
-@pytest.mark.on_time
 async def test_lines_of_a_script_catch_for_an_exact_time(tmp_path: Path) -> None:
     arguments = ("catch", "--duty", "0.5", "--seconds", "1.5", "--valve", "2", "--valve", "3")
     async with session(example(tmp_path), *arguments, by_lines=True) as work:
@@ -187,7 +185,6 @@ async def test_whatever_is_lost_closes_all_valves(ending: str) -> None:
     assert all(order.pulse_us == 1000 for order in peer.orders[-6:])
 
 
-@pytest.mark.on_time
 async def test_on_own_lines_each_valve_clicks_twice_for_a_fifth_of_a_second(tmp_path: Path) -> None:
     setup, port = builders.setup(), free_port()
     link = VehicleLink(f"udpin:127.0.0.1:{port}", ComponentOptions(watch_mission=True))

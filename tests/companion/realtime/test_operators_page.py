@@ -334,7 +334,6 @@ async def is_accessible(page: Page) -> None:
 
 
 @pytest.mark.timeout(180)
-@pytest.mark.on_time
 async def test_a_whole_flight_on_the_stub_is_watched_from_enable_to_landing(
     tmp_path: Path,
 ) -> None:

@@ -116,7 +116,6 @@ def test_each_change_falls_on_its_boundary(tmp_path: Path) -> None:
     check_pass(result)
 
 
-@pytest.mark.on_time
 async def test_two_processes_spray_the_field_over_a_real_socket(tmp_path: Path) -> None:
     port = free_port()
     config = short_field(tmp_path / "field", port)

@@ -66,7 +66,6 @@ async def play_companion(
     half_open(client)
 
 
-@pytest.mark.on_time
 async def test_a_flight_ends_with_the_truth_on_disk(tmp_path: Path) -> None:
     mission = tmp_path / "short.waypoints"
     mission.write_text(MISSION)
@@ -103,7 +102,6 @@ def check_truth(truth: dict[str, Any], result: dict[str, Any]) -> None:
     assert truth["north_m"].max() == pytest.approx(22.2, abs=0.5)
 
 
-@pytest.mark.on_time
 async def test_a_flight_on_px4_sprays_with_actuators(tmp_path: Path) -> None:
     mission = tmp_path / "short.waypoints"
     mission.write_text(MISSION)
