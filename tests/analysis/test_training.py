@@ -24,7 +24,7 @@ from companion.link.component import Component, ComponentOptions
 from tests import builders
 from tests.analysis import report_flight
 from tests.analysis.test_evaluation_flights import Flight, record_of
-from tests.companion.test_component import Peer
+from tests.companion.component_peer import Peer
 from tests.companion.test_sensors_gauges import FakeCounter, FakeLevel
 from tests.companion.wire_peer import free_port, heard
 

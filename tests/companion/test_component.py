@@ -1,109 +1,21 @@
-"""A well-behaved component: heartbeat, answers, streams, texts, sign of life."""
+"""A well-behaved component: heartbeat, answers, streams, a link that returns, orders."""
 
 from __future__ import annotations
 
 import asyncio
-from dataclasses import replace
 from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.core.controller import Memory, step
-from companion.core.types import (
-    ClockReport,
-    Decision,
-    Inhibit,
-    OperatorCommand,
-    SprayPlan,
-    Telemetry,
-)
-from companion.link.announcer import reasons
+from companion.core.types import ClockReport, OperatorCommand, Telemetry
 from companion.link.codec import FROM_ANYONE, FROM_VEHICLE
 from companion.link.component import Component, ComponentOptions
 from companion.link.vehicle_link import VehicleLink
-from tests import builders
+from tests.companion import component_peer
+from tests.companion.component_peer import CLOSED, VEHICLE, Peer, UpAndDown
 
-VEHICLE = 7
-SETUP = builders.setup()
-OPEN, _ = step(SETUP, builders.SPRAYING, Memory(), 10.0)
-CLOSED, _ = step(SETUP, None, Memory(), 10.0)
-
-
-class Peer:
-    """Encodes for an autopilot and a ground station, and reads what the component sent."""
-
-    def __init__(self) -> None:
-        self.sent: list[Any] = []
-        self.is_up = True
-        self._parser = mavlink.MAVLink(None)
-        self._autopilot = mavlink.MAVLink(None, srcSystem=VEHICLE, srcComponent=1)
-        self._ground = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
-
-    def take(self, frame: bytes) -> bool:
-        if self.is_up:
-            self.sent.extend(self._parser.parse_buffer(frame) or [])
-        return self.is_up
-
-    def autopilot(self, name: str, *fields: Any, **more: Any) -> bytes:
-        message = getattr(self._autopilot, f"{name}_encode")(*fields, **more)
-        return bytes(message.pack(self._autopilot))
-
-    def ground(self, name: str, *fields: Any) -> bytes:
-        message = getattr(self._ground, f"{name}_encode")(*fields)
-        return bytes(message.pack(self._ground))
-
-    def heartbeat(self, autopilot: int = 3) -> bytes:
-        return self.autopilot("heartbeat", 2, autopilot, 128, 3, 4)
-
-    def position(self, boot_s: float) -> bytes:
-        boot_ms = round(boot_s * 1000)
-        return self.autopilot("global_position_int", boot_ms, 0, 0, 0, 0, 0, 0, 0, 0)
-
-    def command(
-        self,
-        command: int,
-        *params: float,
-        system: int = VEHICLE,
-        to: int = 191,
-        confirmation: int = 0,
-        sequence: int = 0,
-    ) -> bytes:
-        filled = (*params, *([0.0] * (7 - len(params))))
-        self._ground.seq = sequence
-        return self.ground("command_long", system, to, command, confirmation, *filled)
-
-    def of(self, kind: str) -> list[Any]:
-        return [message for message in self.sent if message.get_type() == kind]
-
-    def texts(self) -> list[str]:
-        return [message.text for message in self.of("STATUSTEXT")]
-
-    def named(self, name: str) -> list[float]:
-        return [m.value for m in self.of("NAMED_VALUE_FLOAT") if m.name == name]
-
-    def asked(self) -> dict[int, float]:
-        """Return the rate asked for, by message, of every SET_MESSAGE_INTERVAL so far."""
-        commands = [m for m in self.of("COMMAND_LONG") if m.command == 511]
-        return {int(m.param1): round(1e6 / m.param2, 3) for m in commands}
-
-
-@pytest.fixture
-def peer() -> Peer:
-    return Peer()
-
-
-@pytest.fixture
-def component(peer: Peer) -> Component:
-    return Component(ComponentOptions(), peer.take)
-
-
-@pytest.fixture
-def met(peer: Peer, component: Component) -> Component:
-    """Return a component that knows its vehicle; what it sent so far is forgotten."""
-    component.receive(peer.heartbeat(), 0.0)
-    peer.sent.clear()
-    return component
+peer, component, met = component_peer.peer, component_peer.component, component_peer.met
 
 
 def test_the_heartbeat_is_there_from_the_first_step(peer: Peer, component: Component) -> None:
@@ -376,157 +288,7 @@ def test_after_the_link_was_away_every_stream_is_asked_for_anew(peer: Peer, met:
     assert WANTED.items() <= peer.asked().items()
 
 
-# -------------------------------------------------------------------------------- announcements
-
-
-def inhibited(*inhibits: Inhibit) -> Decision:
-    return replace(CLOSED, inhibits=frozenset(inhibits))
-
-
-def test_reasons_are_told_when_they_change_and_not_otherwise(peer: Peer, met: Component) -> None:
-    for turn in range(60):
-        met.tick(inhibited(Inhibit.NOT_ENABLED, Inhibit.NOT_ARMED), turn * 0.05)
-    for turn in range(60, 75):
-        met.tick(OPEN, turn * 0.05)
-    assert peer.texts() == ["Spray off: not enabled, not armed"]
-    for turn in range(75, 110):
-        met.tick(OPEN, turn * 0.05)
-    assert peer.texts() == ["Spray off: not enabled, not armed", "Spray: ready"]
-
-
-def test_reasons_that_flicker_are_told_now_and_then(peer: Peer, component: Component) -> None:
-    for turn in range(1200):
-        flicker = Inhibit.POSITION_FROZEN if turn % 12 > 5 else Inhibit.STALE_POSITION
-        component.tick(inhibited(flicker), turn * 0.05)
-    assert 1 <= len(peer.texts()) <= 3
-
-
-def test_turns_of_a_flight_are_no_news_and_a_long_stand_is(
-    peer: Peer, component: Component
-) -> None:
-    for turn in range(20 * 300):
-        now_s = turn * 0.05
-        slow = {Inhibit.SPEED_BELOW_MIN} if now_s % 20.0 > 15.0 else set()
-        component.tick(inhibited(*slow), now_s)
-    assert peer.texts() == ["Spray: ready"]
-    for turn in range(20 * 12):
-        component.tick(inhibited(Inhibit.SPEED_BELOW_MIN), 300.0 + turn * 0.05)
-    assert peer.texts() == ["Spray: ready", "Spray off: too slow"]
-
-
-def test_what_somebody_has_to_see_to_is_told_at_once(peer: Peer, met: Component) -> None:
-    for turn in range(100):
-        met.tick(OPEN, turn * 0.05)
-    met.tick(inhibited(Inhibit.OUTPUT_FAULT), 5.0)
-    assert peer.texts() == ["Spray: ready", "Spray off: output fault"]
-
-
-def test_every_reason_is_said_in_plain_words() -> None:
-    for inhibit in Inhibit:
-        (line,) = reasons(frozenset({inhibit}))
-        assert line.startswith("Spray off: ")
-        assert len(line) <= 50
-        assert "-" not in line
-
-
-def test_all_reasons_at_once_are_two_lines_that_count_the_rest(peer: Peer, met: Component) -> None:
-    met.tick(inhibited(*Inhibit), 0.0)
-    texts = peer.texts()
-    assert [text[:11] for text in texts] == ["Spray off: "] * 2
-    assert all(len(text) <= 50 for text in texts)
-    told = ", ".join(text[11:].rpartition(" +")[0] or text[11:] for text in texts).split(", ")
-    names = [reasons(frozenset({inhibit}))[0][11:] for inhibit in Inhibit]
-    assert ", ".join(told) in ", ".join(names)
-    rest = int(texts[1].rpartition("+")[2])
-    assert len(", ".join(told)) + len(", ".join(names[-rest:])) + 2 == len(", ".join(names))
-
-
-def test_why_an_enabled_sprayer_is_closed_is_said_again_every_half_minute(
-    peer: Peer, component: Component
-) -> None:
-    for turn in range(2 * 61):
-        component.tick(inhibited(Inhibit.STALE_POSITION), turn * 0.5)
-    assert peer.texts() == ["Spray off: position too old"] * 3
-    peer.sent.clear()
-    for turn in range(2 * 61):
-        component.tick(inhibited(Inhibit.NOT_ENABLED), 100.0 + turn * 0.5)
-    assert len(peer.texts()) == 1
-
-
-def test_notes_are_told_slowly_and_no_more_than_a_few_wait(peer: Peer, met: Component) -> None:
-    for number in range(100):
-        met.receive(peer.command(216, 2.0 + number), 0.0)
-        met.receive(peer.command(31010, 1.0), 0.0)
-    met.tick(None, 0.0)
-    assert len(peer.texts()) == 1
-    for turn in range(200):
-        met.tick(None, turn * 0.05)
-    assert peer.texts() == ["Spray: DO_SPRAYER takes 0 or 1"]
-
-
-def test_a_fault_is_told_once_as_an_error(peer: Peer, met: Component) -> None:
-    met.fault("servo order failed")
-    for turn in range(50):
-        met.tick(OPEN, turn * 0.05)
-    errors = [m.text for m in peer.of("STATUSTEXT") if m.severity == 3]
-    assert errors == ["Spray: servo order failed"]
-
-
-def test_values_are_told_once_a_second(peer: Peer, met: Component) -> None:
-    for turn in range(60):
-        met.tick(OPEN, turn * 0.05)
-    assert len(peer.named("SPR_FLOW")) == 3
-    assert peer.named("SPR_STATE") == [4.0] * 3
-    assert peer.named("SPR_RATE")[0] == pytest.approx(20.0)
-
-
-def test_the_sign_of_life_comes_ten_times_a_second_while_valves_may_be_open(
-    peer: Peer, met: Component
-) -> None:
-    assert not OPEN.plan.is_off
-    for turn in range(60):
-        met.tick(OPEN, turn * 0.033)
-    assert 19 <= len(peer.named("SPR_LIVE")) <= 21
-
-
-def test_there_is_no_sign_of_life_while_everything_stays_closed(peer: Peer, met: Component) -> None:
-    for turn in range(60):
-        met.tick(CLOSED, turn * 0.05)
-    assert not peer.named("SPR_LIVE")
-
-
-def test_the_sign_of_life_comes_before_a_valve_opens(peer: Peer, met: Component) -> None:
-    later = SprayPlan(
-        sequence=1,
-        issued_s=0.0,
-        duty=(0.0,) * 6,
-        changes=tuple(OPEN.plan.changes)[:1],
-        lease_until_s=0.3,
-    )
-    met.tick(replace(OPEN, plan=later), 0.0)
-    assert len(peer.named("SPR_LIVE")) == 1
-
-
 # ------------------------------------------------------------------------------ link that returns
-
-
-class UpAndDown:
-    """A transport whose state the test sets."""
-
-    speaker = None
-
-    def adopt(self, speaker: object, now_s: float, *, is_vehicle: bool) -> None:
-        """Do nothing: there is one other end."""
-
-    def __init__(self, peer: Peer) -> None:
-        self.is_up = True
-        self._peer = peer
-
-    def send(self, data: bytes) -> bool:
-        return self.is_up and self._peer.take(data)
-
-    async def close(self) -> None:
-        self.is_up = False
 
 
 @pytest.mark.parametrize("heard_first", [True, False])

@@ -12,7 +12,7 @@ from companion.core.types import EstopReport, OperatorCommand, RateOverride
 from companion.link.component import Component, ComponentOptions
 from companion.link.parameters import Parameters, known_parameters
 from tests import builders
-from tests.companion.test_component import VEHICLE, Peer
+from tests.companion.component_peer import VEHICLE, Peer
 
 SETUP = builders.setup()
 OPEN, _ = step(SETUP, builders.SPRAYING, Memory(), 10.0)

@@ -13,7 +13,7 @@ from companion.core.types import Input, RcReport
 from companion.link.component import Component, ComponentOptions, News
 from companion.link.messages import ServoOutput
 from tests import builders
-from tests.companion.test_component import Peer
+from tests.companion.component_peer import Peer
 
 UP_S = 300.0
 PLAIN = builders.setup()

@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.link.codec import Codec
 from companion.link.component import Component, ComponentOptions
 from companion.link.vehicle_link import VehicleLink
-from tests.companion.test_component import CLOSED, Peer, UpAndDown
+from tests.companion.component_peer import CLOSED, Peer, UpAndDown
 
 
 def frames(numbers: list[int], system: int = 1) -> bytes:

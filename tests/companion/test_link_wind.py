@@ -9,7 +9,7 @@ import pytest
 from companion.core.types import Inhibit, Input, LandedReport, WindReport
 from companion.link.component import STILL_MAX_S, Component, ComponentOptions, WindWatch
 from tests.bench.gate_frames import STEP_S, Loop, Vehicle, long_setup
-from tests.companion.test_component import Peer
+from tests.companion.component_peer import Peer
 
 IN_AIR = LandedReport(received_s=0.0, in_air=True)
 

@@ -18,7 +18,7 @@ from companion.core.types import RateOverride
 from companion.errors import ConfigError, LinkError
 from companion.link.component import Component, ComponentOptions
 from companion.link.parameters import Parameters, known_parameters, read_state, write_state
-from tests.companion.test_component import OPEN, VEHICLE, Peer
+from tests.companion.component_peer import OPEN, VEHICLE, Peer
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "anyang"
 LAGS = {

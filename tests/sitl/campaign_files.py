@@ -12,7 +12,7 @@ from companion.errors import VrsprayError
 from sitl.anyang import EXAMPLE
 from sitl.campaign.bundle import Bundle, bundle_of, unpack
 from sitl.campaign.dataset import Dataset, open_dataset
-from sitl.campaign.design import read_campaign
+from sitl.campaign.design import Campaign, read_campaign
 from sitl.campaign.running import Tally, fly_missing
 
 # Home, take-off, 5 m/s, and 45 m along the first pass.
@@ -28,6 +28,16 @@ version = 1
 [fixed]
 flight.config = "field/config.toml"
 flight.mission = "field/short.waypoints"
+"""
+
+VARIED = """
+seeds = 4
+[[vary]]
+set = "vehicle.gust_m_s"
+values = [0.0, 1.0, 2.0]
+[[vary]]
+set = "config.lag.up_s"
+values = [0.10, -1.0]
 """
 
 
@@ -95,3 +105,14 @@ def fly_here(file: Path, out: Path) -> Tally:
     workers = OwnProcess(unpack(bundle, out.with_name(f"{out.name}-bundle")))
     fly_missing(dataset, bundle, workers, tally, tell=lambda _: None)
     return tally
+
+
+def designed(folder: Path, kind: str, samples: int) -> Campaign:
+    return read_campaign(
+        write_campaign(
+            folder,
+            f'seeds = {{first = 5, count = 2}}\n[design]\nkind = "{kind}"\nsamples = {samples}\n'
+            '[[vary]]\nset = "vehicle.gust_m_s"\nlow = 1.0\nhigh = 3.0\n'
+            '[[vary]]\nset = "flight.fidelity"\nvalues = ["averaged", "pulsed"]\n',
+        )
+    )
