@@ -44,8 +44,17 @@ _LEFT_OPEN = tempfile.TemporaryDirectory(prefix="vrspray-left-open-")
 OBJECTS_BEFORE_COLLECTION = 100_000
 
 
-def pytest_configure() -> None:
-    """Have the Python processes that tests start tell of what they leave open."""
+_FAIR_TIME = pytest.StashKey["FairTime"]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Have the Python processes that tests start tell of what they leave open, and one clock."""
+    # Before what is tested is imported. Not in a process that has others test, and only here: this
+    # file serves projects of one test as well.
+    if config.getoption("dist", "no") == "no" and Path(__file__).with_name("fair_time.py").exists():
+        from tests.fair_time import FairTime
+
+        config.stash[_FAIR_TIME] = FairTime()
     gc.set_threshold(OBJECTS_BEFORE_COLLECTION, 20, 20)
     os.environ["VRSPRAY_LEFT_OPEN"] = _LEFT_OPEN.name
     ours = str(Path(__file__).parent / "child_python")
@@ -55,9 +64,11 @@ def pytest_configure() -> None:
     os.environ.pop("PYTHONDEVMODE", None)
 
 
-def pytest_unconfigure() -> None:
-    """Remove the place where children tell."""
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Remove the places where children tell, and what tells them the time."""
     _LEFT_OPEN.cleanup()
+    if (fair_time := config.stash.get(_FAIR_TIME, None)) is not None:
+        fair_time.close()
 
 
 def pytest_asyncio_loop_factories(item: pytest.Item) -> Mapping[str, LoopFactory]:
@@ -218,13 +229,12 @@ async def no_task_left_behind(no_thread_left_behind: None) -> AsyncIterator[None
 
 
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
-    """Have flights in real time that fail told how long this computer held them up."""
-    if not {"realtime", "firmware"} & set(item.path.parts):
+    """Fly what flies in real time by a clock that stands while the computer holds it up."""
+    if "realtime" not in item.path.parts:
         return None
-    # Only here: this file serves projects of one test as well.
-    from tests import held_up
+    from tests import fair_time
 
-    held_up.fly(item, nextitem)
+    fair_time.fly(item.config.stash[_FAIR_TIME], item, nextitem)
     return True
 
 

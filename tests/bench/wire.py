@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
-import re
 import shutil
 import sys
 import tempfile
@@ -49,19 +48,6 @@ def example(folder: Path, *, autopilot: str, port: int, dither_us: int = 0) -> P
 
 # Of a receiver with corrections, as the twin and the ArduPilot stub have it.
 RTK = "[position]\ndrift_m = 0.014\ndrift_time_s = 30.0\n"
-
-
-# A vehicle that did nothing for so long, or orders that left so late, are a computer's that stood
-# still: at 5 m/s 0.75 m.
-STOOD_STILL_MS = 150.0
-_LATEST = re.compile(r"latest by ([0-9.]+) ms")
-
-
-def stood_still(flight: dict[str, Any], said: str) -> bool:
-    """Whether the computer stood still in a flight, by what the stub and the companion measured."""
-    latest = _LATEST.search(said)
-    late_ms = [flight["late_ms"]["max"], *([] if latest is None else [float(latest[1])])]
-    return max(late_ms) > STOOD_STILL_MS
 
 
 async def start(*command: str) -> asyncio.subprocess.Process:

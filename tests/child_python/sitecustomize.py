@@ -1,8 +1,8 @@
 """In every Python that a test starts: what it leaves open is written down for the test to see.
 
 So is what is imported for the first time while the control loop turns: that holds the loop up,
-maybe with valves open. `tests/conftest.py` puts this folder on the path of child processes and
-names the place.
+maybe with valves open. A flight's processes go by its clock (`fair_clock.py`). `tests/conftest.py`
+puts this folder on the path of child processes and names the places.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import os
 import sys
 import threading
 import warnings
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -51,6 +52,13 @@ def _is_turning() -> bool:
         frame = frame.f_back
     return False
 
+
+# Before anything else has asked for the time. A flight that is over has no clock any more.
+if (_clock := os.environ.get("VRSPRAY_FAIR_CLOCK")) and __name__ == "sitecustomize":
+    with suppress(OSError):
+        from fair_clock import FairClock
+
+        FairClock(Path(_clock)).rule()
 
 # Not where pytest looks through the modules for doctests.
 if _folder is not None and __name__ == "sitecustomize":

@@ -16,7 +16,6 @@ from pyogrio.raw import write
 
 from companion.core.frame import LocalFrame
 from sitl.serve import ServeOptions
-from tests.bench.wire import stood_still
 from tests.bench.wire_clock import fly
 from tests.companion.wire_peer import free_port
 
@@ -143,10 +142,7 @@ async def test_two_processes_spray_the_field_over_a_real_socket(tmp_path: Path) 
     metrics = result["metrics"]
     asked_l = sum(RATES) * PLOT_M * 6.0 / 10_000.0
     assert result["state"] == "landed"
-    assert 0.2 * asked_l < result["volume_l"] <= 1.1 * asked_l
-    if stood_still(result, said.decode()):
-        return
-    # On a busy computer orders come late; how exactly they fall is the other test's matter.
+    # Orders may come a little late here; how exactly they fall is the other test's matter.
     assert metrics["missed"] == 0
     assert metrics["lag_distance_m"]["mean_abs"] <= 0.5
     assert result["volume_l"] == pytest.approx(asked_l, rel=0.1)

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import pytest
 
 from sitl.serve import ServeOptions
-from tests.bench.wire import RTK, start, stood_still
+from tests.bench.wire import RTK, start
 from tests.bench.wire_clock import fly
 from tests.companion.realtime import client_bench
 from tests.companion.wire_peer import free_port
@@ -22,8 +22,6 @@ from tests.sitl.stub_bench import HOME
 
 pytest.importorskip("mavsdk.asyncio")
 pytestmark = [pytest.mark.sitl, pytest.mark.timeout(300)]
-# A computer that stood still in each of so many flights cannot show how well they are sprayed.
-FLIGHTS_MAX = 3
 
 # Beside the field: the way home then crosses it at an angle.
 DEPOT = "{:.7f},{:.7f}".format(*HOME.to_geographic(12.0, 0.0))
@@ -102,9 +100,7 @@ async def flown(config: Path, serve: tuple[str, ...], port: int) -> tuple[dict[s
             if process is not None and process.returncode is None:
                 process.kill()
                 await process.communicate()
-    flight = json.loads(out)
-    flight["stood_still"] = stood_still(flight, said.decode())
-    return plan, upload, flight
+    return plan, upload, json.loads(out)
 
 
 # PX4 tells of its mission every ten seconds only, and is armed before: the companion asks for it.
@@ -114,29 +110,21 @@ async def test_what_was_planned_is_uploaded_flown_and_sprayed_on_its_lines(
 ) -> None:
     scenario = tmp_path / "rtk.toml"
     scenario.write_text(RTK)
-    for turn in range(FLIGHTS_MAX):
-        folder = tmp_path / str(turn)
-        folder.mkdir()
-        config, truth = write_field(folder, autopilot), folder / "truth"
-        plan, upload, flight = await flown(
-            config,
-            (
-                *("--autopilot", autopilot, "--corners", CORNERS),
-                *("--scenario", str(scenario), "--out", str(truth)),
-            ),
-            free_port(),
-        )
-        if not flight["stood_still"]:
-            break
+    config, truth = write_field(tmp_path, autopilot), tmp_path / "truth"
+    plan, upload, flight = await flown(
+        config,
+        (
+            *("--autopilot", autopilot, "--corners", CORNERS),
+            *("--scenario", str(scenario), "--out", str(truth)),
+        ),
+        free_port(),
+    )
     asked_l = sum(RATES_L_HA) * PLOT_M * WIDTH_M / 10_000.0
     assert plan["volume_l"] == pytest.approx(asked_l, rel=0.02)
     assert (upload["ok"], upload["firmware"]) == (True, autopilot)
     assert flight["uploaded_items"] == upload["items"]
     assert (flight["state"], flight["enabled"], flight["speed_m_s"]) == ("landed", True, 5.0)
     metrics = json.loads((truth / "truth.json").read_text())["metrics"]
-    assert flight["volume_l"] <= 1.1 * plan["volume_l"]
-    if flight["stood_still"]:
-        return
     assert metrics["missed"] == 0
     # Flown from the far end, where it starts from a stop, an outer valve is barely open before it
     # changes: that one counts apart.
