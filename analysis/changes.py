@@ -19,7 +19,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely import STRtree
 
-from analysis.track import Bools, Floats, Places, Track, in_field
+from analysis.track import PIECE, Bools, Floats, Places, Track, in_field
 from companion.core.cells import NO_RATE
 
 if TYPE_CHECKING:
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from companion.core.prescription import Prescription
 
 Ints = NDArray[np.int64]
+# Numbers of points or lines, and of parts of zones: each time one of either.
+Pairs = tuple[Ints, Ints]
 
-# A path is looked at in pieces of so many points: 1.4 m, where they are 0.09 m apart.
-PIECE = 16
 # Points this near to an edge are looked at one by one: arithmetic is not exact.
 NEAR_M = 0.002
 
@@ -50,14 +50,29 @@ class ZoneLookup:
         self._parts, self._owner = shapely.get_parts(polygons, return_index=True)
         shapely.prepare(self._parts)
         self._tree = STRtree(self._parts)
+        ends = self._edges.ends
+        along = ends[:, 2:] - ends[:, :2]
+        length_m = np.sqrt((along**2).sum(axis=1))
+        self._along = along / np.maximum(length_m, 1e-9)[:, np.newaxis]
+        self._length_m = length_m
 
-    def keys(self, east_m: Floats, north_m: Floats) -> Ints:
-        """Return the number of the zones at each point."""
+    def pairs(self, shapes: shapely.Geometry | NDArray[np.object_]) -> Pairs:
+        """Return the numbers of shapes, and of the parts of zones that their boxes meet."""
+        number, parts = self._tree.query(np.asarray(shapes, dtype=object))
+        return number, parts
+
+    def keys(self, east_m: Floats, north_m: Floats, pairs: Pairs | None = None) -> Ints:
+        """Return the number of the zones at each point.
+
+        `pairs` are numbers of points, in order, and each time of a part that it may lie in.
+        """
         if self._cells is not None:
             kinds = self._cells.classes_at(east_m, north_m)
             return np.where(kinds == NO_RATE, 0, kinds + 1)
         found = np.zeros(len(east_m), dtype=np.int64)
-        points, parts = self._tree.query(shapely.points(np.column_stack((east_m, north_m))))
+        if pairs is None:
+            pairs = self.pairs(shapely.points(np.column_stack((east_m, north_m))))
+        points, parts = pairs
         within = shapely.contains_xy(self._parts[parts], east_m[points], north_m[points])
         points, zones = points[within], self._owner[parts[within]]
         found[points] = zones + 1
@@ -85,18 +100,47 @@ class ZoneLookup:
         pieces = (len(east_m) - 1) // PIECE
         if self._cells is not None or pieces < 1:
             return np.zeros(max(pieces, 0), dtype=np.bool_)
-        ends = np.arange(pieces + 1) * PIECE
-        way_m = np.concatenate(([0.0], np.cumsum(np.hypot(np.diff(east_m), np.diff(north_m)))))
-        chords = np.column_stack((east_m, north_m))[ends]
-        chord_m = np.hypot(*(chords[1:] - chords[:-1]).T)
-        length_m = np.diff(way_m[ends])
+        moved_m = np.sqrt(np.diff(east_m) ** 2 + np.diff(north_m) ** 2)
+        length_m = moved_m[: pieces * PIECE].reshape(pieces, PIECE).sum(axis=1)
+        chords = np.column_stack((east_m, north_m))[: pieces * PIECE + 1 : PIECE]
+        starts, ends = chords[:-1], chords[1:]
+        chord_m = np.sqrt(((ends - starts) ** 2).sum(axis=1))
         # A point of a piece is no farther from its chord than at the top of the tightest arch.
         aside_m = 0.5 * np.sqrt(np.maximum(length_m**2 - chord_m**2, 0.0)) + NEAR_M
-        lines = shapely.linestrings(np.stack((chords[:-1], chords[1:]), axis=1))
-        near, _ = self._edges.tree.query(lines, predicate="dwithin", distance=aside_m)
+        margin = aside_m[:, np.newaxis]
+        corners = np.minimum(starts, ends) - margin, np.maximum(starts, ends) + margin
+        # A line from corner to corner has the box that is asked for, and is made sooner.
+        piece, edge = self._edges.tree.query(shapely.linestrings(np.stack(corners, axis=1)))
+        near = piece[self._are_near(starts[piece], ends[piece], edge, aside_m[piece])]
         clear = np.ones(pieces, dtype=np.bool_)
         clear[near] = False
         return clear
+
+    def _are_near(self, starts: Floats, ends: Floats, edge: Ints, aside_m: Floats) -> Bools:
+        """Return which chords may be so near to an edge each: of no direction it is known better.
+
+        Seen along the edge, across it, or across the chord, what is apart is apart.
+        """
+        along, first = self._along[edge], self._edges.ends[edge, :2]
+        from_m, to_m = (((each - first) * along).sum(axis=1) for each in (starts, ends))
+        far = np.minimum(from_m, to_m) > self._length_m[edge] + aside_m
+        far |= np.maximum(from_m, to_m) < -aside_m
+        left_m, right_m = (_cross(along, each - first) for each in (starts, ends))
+        far |= np.minimum(left_m, right_m) > aside_m
+        far |= np.maximum(left_m, right_m) < -aside_m
+        chord = ends - starts
+        reach = aside_m * np.sqrt((chord**2).sum(axis=1))
+        left, right = (_cross(chord, each - starts) for each in (first, self._edges.ends[edge, 2:]))
+        far |= np.minimum(left, right) > reach
+        far |= np.maximum(left, right) < -reach
+        near: Bools = ~far
+        return near
+
+
+def _cross(one: Floats, other: Floats) -> Floats:
+    """Return how far each vector lies to the left of another, times the length of that."""
+    found: Floats = one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]
+    return found
 
 
 _KNOWN: WeakKeyDictionary[Prescription, ZoneLookup] = WeakKeyDictionary()
@@ -220,28 +264,48 @@ class _States:
 
     def at(self, time_s: Floats, east_m: Floats, north_m: Floats) -> Ints:
         """Return the number of the state at places where the middles of strips are at a time."""
-        inside = in_field(self.prescription, east_m, north_m)
-        planned = self.tracks[0].planned
-        if planned is not None:
-            inside &= planned.flown(time_s, east_m, north_m)
+        inside = self._inside(time_s, east_m, north_m)
         index = np.flatnonzero(inside)
         states = np.full(len(inside), OUTSIDE)
         states[index] = self.lookup.keys(east_m[index], north_m[index])
         return states
 
-    def under(self, number: Ints, time_s: Floats) -> Ints:
-        """Return the states under tracks by their numbers, each at a time of its own."""
+    def _inside(self, time_s: Floats, east_m: Floats, north_m: Floats) -> Bools:
+        inside = in_field(self.prescription, east_m, north_m)
+        planned = self.tracks[0].planned
+        return inside if planned is None else inside & planned.flown(time_s, east_m, north_m)
+
+    def around(self, number: Ints, time_s: Floats, way_m: Floats) -> Pairs:
+        """Return which parts of zones lie so near to where tracks by their numbers are."""
+        places = np.column_stack(self._places(number, time_s))
+        reach_m = way_m[:, np.newaxis] + NEAR_M
+        corners = np.stack((places - reach_m, places + reach_m), axis=1)
+        return self.lookup.pairs(shapely.linestrings(corners))
+
+    def under(self, number: Ints, time_s: Floats, around: Pairs) -> Ints:
+        """Return the states under tracks by their numbers, each at a time of its own.
+
+        No zones are looked at but those of `around`.
+        """
+        places = self._places(number, time_s)
+        inside = self._inside(time_s, *places)
+        return np.where(inside, self.lookup.keys(*places, around), OUTSIDE)
+
+    def _places(self, number: Ints, time_s: Floats) -> tuple[Floats, Floats]:
+        """Return where tracks by their numbers are, each at a time of its own."""
         # As `Track.at` of each track, for all of them at once.
         before = np.searchsorted(self._time_s, time_s, "right") - 1
         before = np.clip(before, 0, len(self._time_s) - 2)
         whole_s = self._time_s[before + 1] - self._time_s[before]
         after_s = time_s - self._time_s[before]
-        places = []
-        for each in (self._east_m, self._north_m):
-            low, high = each[number, before], each[number, before + 1]
+        is_past = time_s >= self._time_s[-1]
+
+        def place_m(values: Floats) -> Floats:
+            low, high = values[number, before], values[number, before + 1]
             place = (high - low) / whole_s * after_s + low
-            places.append(np.where(time_s >= self._time_s[-1], each[number, -1], place))
-        return self.at(time_s, *places)
+            return np.where(is_past, values[number, -1], place)
+
+        return place_m(self._east_m), place_m(self._north_m)
 
     def along(self) -> list[Ints]:
         """Return the states at all marks; where no edge is near, one of a piece says all."""
@@ -267,20 +331,28 @@ class _States:
             asked[(clear[:, np.newaxis] + np.arange(1, PIECE)).ravel()] = False
         return asked
 
-    def run(self, track: Track, state: int, start_s: float, end_s: float) -> Run:
-        """Return the run of a state between two times."""
-        inside = state != OUTSIDE
-        zones = self.lookup.zones(state) if inside else frozenset()
-        rate = self.prescription.rate_of(zones) if inside else None
-        return Run(
-            start_s=start_s,
-            end_s=end_s,
-            start_m=track.value(track.distance_m, start_s),
-            end_m=track.value(track.distance_m, end_s),
-            inside=inside,
-            rate_l_ha=0.0 if rate is None else rate,
-            zones=zones,
-        )
+    def runs(self, track: Track, states: Sequence[int], ends_s: Floats) -> list[Run]:
+        """Return the runs of states, one after the other between these times."""
+        ends_m = track.each_value(track.distance_m, ends_s).tolist()
+        found = []
+        for state, span_s, span_m in zip(
+            states, pairwise(ends_s.tolist()), pairwise(ends_m), strict=True
+        ):
+            inside = state != OUTSIDE
+            zones = self.lookup.zones(state) if inside else frozenset()
+            rate = self.prescription.rate_of(zones) if inside else None
+            found.append(
+                Run(
+                    start_s=span_s[0],
+                    end_s=span_s[1],
+                    start_m=span_m[0],
+                    end_m=span_m[1],
+                    inside=inside,
+                    rate_l_ha=0.0 if rate is None else rate,
+                    zones=zones,
+                )
+            )
+        return found
 
 
 def find_runs(track: Track, prescription: Prescription) -> list[Run]:
@@ -295,21 +367,19 @@ def find_all_runs(tracks: Sequence[Track], prescription: Prescription) -> list[l
     turns = [np.flatnonzero(each[1:] != each[:-1]) for each in found]
     number = np.repeat(np.arange(len(tracks)), [len(each) for each in turns])
     marks_s = [track.time_s[track.marks] for track in tracks]
-    before, low_s, high_s = (
+    marks_m = [track.distance_m[track.marks] for track in tracks]
+    before, low_s, high_s, from_m, to_m = (
         np.concatenate([each[at + ahead] for each, at in zip(values, turns, strict=True)])
-        for values, ahead in ((found, 0), (marks_s, 0), (marks_s, 1))
+        for values, ahead in ((found, 0), (marks_s, 0), (marks_s, 1), (marks_m, 0), (marks_m, 1))
     )
-    edges_s = bisect(lambda t: states.under(number, t) == before, low_s, high_s)
+    # What lies around each way from one mark to the next is sought once.
+    around = states.around(number, low_s, to_m - from_m)
+    edges_s = bisect(lambda t: states.under(number, t, around) == before, low_s, high_s)
     runs = []
     for i, track in enumerate(tracks):
         its = number == i
-        ends_s = [float(marks_s[i][0]), *edges_s[its].tolist(), float(marks_s[i][-1])]
-        own = [
-            states.run(track, state, start_s, end_s)
-            for state, (start_s, end_s) in zip(
-                [*before[its].tolist(), int(found[i][-1])], pairwise(ends_s), strict=True
-            )
-        ]
+        ends_s = np.concatenate((marks_s[i][:1], edges_s[its], marks_s[i][-1:]))
+        own = states.runs(track, [*before[its].tolist(), int(found[i][-1])], ends_s)
         runs.append(_merged(_without_slivers(own), key=lambda run: (run.inside, run.zones)))
     return runs
 
@@ -324,11 +394,15 @@ def changes_of(track: Track, stretches: Sequence[Run]) -> list[Change | None]:
 
     None stands for a border without a rate on its inner side, and for a standing aircraft.
     """
-    return [_change(track, before, after) for before, after in pairwise(stretches)]
+    starts_s = np.array([each.start_s for each in stretches[1:]])
+    speeds_m_s = track.each_value(track.speed_m_s, starts_s).tolist()
+    return [
+        _change(track, before, after, speed_m_s)
+        for (before, after), speed_m_s in zip(pairwise(stretches), speeds_m_s, strict=True)
+    ]
 
 
-def _change(track: Track, before: Run, after: Run) -> Change | None:
-    speed_m_s = track.value(track.speed_m_s, after.start_s)
+def _change(track: Track, before: Run, after: Run, speed_m_s: float) -> Change | None:
     if before.rate_l_ha == after.rate_l_ha or not speed_m_s > SPEED_MIN_M_S:
         return None
     return Change(

@@ -84,7 +84,7 @@ def holds_of(
     index = np.flatnonzero(is_closed & asks)
     # Straight up to a border no end of the strip comes near it before its middle is beyond.
     by_border = ~(inside[np.maximum(index - 1, 0)] & inside[np.minimum(index + 1, len(inside) - 1)])
-    clear = track.wholly_inside(prescription, track.marked().some(index), widen_m=CLEAR_M)
+    clear = track.wholly_inside(prescription, track.sampled(track.marks[index]), widen_m=CLEAR_M)
     near = index[by_border | ~clear | spared[index]]
     # Orders of 0 upon orders of 0 open nothing: a closed time is known by the last that opened.
     opened = np.concatenate(([0], np.cumsum(duty > 0.0)))[given]

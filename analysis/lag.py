@@ -14,6 +14,7 @@ truth, so that the figures differ by up to half a metre for that reason alone.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, NamedTuple
@@ -32,8 +33,8 @@ from analysis.transitions import (
     Sides,
     SmoothTrack,
     Transition,
+    doses_per_rate_ml_m,
     find_transitions,
-    prescribed_dose_ml_m,
 )
 
 if TYPE_CHECKING:
@@ -107,33 +108,42 @@ def measure_steps(
     sides = sides_of(smooth, stretches, holds)
     transitions = find_transitions(smooth, sides, changes)
     lags_m = _lag_distances_m(smooth, changes, transitions, sides)
+    asked, given = _doses_ml_m(track, changes, transitions)
+    dry = np.any(given < DRY_BELOW * asked, axis=1).tolist()
+    saturated = _are_saturated(orders, duty_limits, sides, asked, given).tolist()
     steps: list[Step] = []
     for i, change in enumerate(changes):
         if change is None:
             continue
-        transition, pair = transitions[i], (sides[i].before, sides[i].after)
-        per_rate = prescribed_dose_ml_m(track, 1.0, change.time_s)
-        asked = (per_rate * change.before_l_ha, per_rate * change.after_l_ha)
-        dry = any(
-            given < DRY_BELOW * dose
-            for given, dose in zip(transition.levels_ml_m, asked, strict=True)
-        )
-        verdict = _verdict(change, sides[i], transition)
-        if (
-            min(asked) > 0.0
-            and verdict in (Verdict.MEASURED, Verdict.MISSED)
-            and any(
-                _is_saturated(orders, duty_limits, stretch, doses)
-                for stretch, *doses in zip(pair, asked, transition.levels_ml_m, strict=True)
-            )
-        ):
+        verdict = _verdict(change, sides[i], transitions[i])
+        if saturated[i] and verdict in (Verdict.MEASURED, Verdict.MISSED):
             verdict = Verdict.SATURATED
         lag_m = None
         if verdict is Verdict.MEASURED:
             lag_m = lags_m[i]
             verdict = Verdict.CLOSE if lag_m is None else verdict
-        steps.append(Step(change=change, verdict=verdict, dry=dry, lag_distance_m=lag_m))
+        steps.append(Step(change=change, verdict=verdict, dry=dry[i], lag_distance_m=lag_m))
     return steps
+
+
+def _doses_ml_m(
+    track: Track, changes: Sequence[Change | None], transitions: Sequence[Transition]
+) -> tuple[Floats, Floats]:
+    """Return what is asked for before and after each change, and what was given; a row a change.
+
+    NaN is asked where there is no change.
+    """
+    nowhere = (math.nan, math.nan, math.nan)
+    told = [
+        nowhere if each is None else (each.time_s, each.before_l_ha, each.after_l_ha)
+        for each in changes
+    ]
+    table = np.array(told).reshape(-1, 3)
+    is_one = ~np.isnan(table[:, 0])
+    asked = np.full((len(table), 2), math.nan)
+    per_rate = doses_per_rate_ml_m(track, table[is_one, 0])
+    asked[is_one] = per_rate[:, np.newaxis] * table[is_one, 1:]
+    return asked, np.array([each.levels_ml_m for each in transitions]).reshape(-1, 2)
 
 
 def _verdict(change: Change, sides: Sides, transition: Transition) -> Verdict:
@@ -199,26 +209,32 @@ def _lines(smooth: SmoothTrack, near_s: Floats, far_s: Floats, closed: Bools) ->
     )
 
 
-def _is_saturated(
+def _are_saturated(
     orders: Orders,
     duty_limits: tuple[float, float],
-    stretch: Run,
-    doses_ml_m: Sequence[float],
-) -> bool:
-    """Return whether a stretch's duty is at a limit and its dose short of what is asked, or over.
+    sides: Sequence[Sides],
+    asked: Floats,
+    given: Floats,
+) -> Bools:
+    """Return at which changes a stretch's duty is at a limit and its dose short of what is asked.
+
+    Or over it. Something must be asked for before and after; doses are as `_doses_ml_m` has them.
 
     A valve that gives nothing is not at its limit; it does not work. A switch on or off is placed
     by the flow's own level and needs no limit.
     """
-    middle_s = stretch.start_s + 0.5 * stretch.dwell_s
-    number = int(np.searchsorted(orders.at_s, middle_s, "right"))
-    asked, given = doses_ml_m
-    if not number:
-        return False
-    duty = orders.duty.item(number - 1)
-    short = duty >= duty_limits[1] and DRY_BELOW < given / asked < 1.0 - SATURATED_ERROR
-    over = 0.0 < duty <= duty_limits[0] and given > asked * (1.0 + SATURATED_ERROR)
-    return short or over
+    found: Bools = np.all(asked > 0.0, axis=1)
+    if not (len(orders) and found.any()):
+        return np.zeros(len(sides), dtype=np.bool_)
+    stretches = [stretch for side in sides for stretch in (side.before, side.after)]
+    middles_s = np.array([stretch.start_s + 0.5 * stretch.dwell_s for stretch in stretches])
+    number = np.searchsorted(orders.at_s, middles_s.reshape(-1, 2), "right")
+    duty = orders.duty[np.maximum(number - 1, 0)]
+    share = np.divide(given, asked, out=np.zeros_like(given), where=found[:, np.newaxis])
+    short = (duty >= duty_limits[1]) & (share > DRY_BELOW) & (share < 1.0 - SATURATED_ERROR)
+    over = (duty > 0.0) & (duty <= duty_limits[0]) & (given > asked * (1.0 + SATURATED_ERROR))
+    found &= np.any((number > 0) & (short | over), axis=1)
+    return found
 
 
 # -------------------------------------------------------------------------------- P1's lag distance

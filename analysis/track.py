@@ -182,6 +182,12 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 MARK_SPACING_M = 0.09
+# A path is looked at in pieces of so many points: 1.4 m, where they are `MARK_SPACING_M` apart. Far
+# from the border one says it for all, as far as they are this near to the middle one.
+PIECE = 16
+PIECE_REACH_M = 1.0
+# For fewer pieces it takes longer than to ask for every point.
+PIECES_FROM = 64
 # A strip's ends may touch the border: tiled strips do, and arithmetic is not exact.
 TOUCH_M = 0.001
 
@@ -246,10 +252,25 @@ class Track:
         low = values.item(i)
         return low + (values.item(i + 1) - low) * (where - i)
 
+    def each_value(self, values: Floats, time_s: Floats) -> Floats:
+        """Return `value` at each of many times, to the bit."""
+        last = len(values) - 1
+        where = np.minimum(np.maximum((time_s - self.time_s[0]) / self.step_s, 0.0), float(last))
+        i = np.minimum(where.astype(np.int64), last - 1)
+        low = values[i]
+        found: Floats = low + (values[i + 1] - low) * (where - i)
+        return found
+
     def sample(self, time_s: float) -> int:
         """Return the sample at or just before a time."""
         where = (time_s - self.time_s.item(0)) / self.step_s
         return int(min(max(where, 0.0), len(self.time_s) - 1.0))
+
+    def samples(self, time_s: Floats) -> Ints:
+        """Return `sample` of each of many times."""
+        where = (time_s - self.time_s[0]) / self.step_s
+        found: Ints = np.minimum(np.maximum(where, 0.0), len(self.time_s) - 1.0).astype(np.int64)
+        return found
 
     def places(self, time_s: Floats) -> Places:
         """Return the places at any times."""
@@ -257,20 +278,27 @@ class Track:
         return Places(time_s, *values)
 
     def marked(self) -> Places:
-        """Return the places at all marks: they are samples, and nothing is to be sought."""
+        """Return the places at all marks."""
+        return self.sampled(self.marks)
+
+    def sampled(self, which: Ints) -> Places:
+        """Return the places at samples: nothing is to be sought."""
         values = (self.time_s, self.east_m, self.north_m, self.heading_rad)
-        return Places(*(each[self.marks] for each in values))
+        return Places(*(each[which] for each in values))
 
     def wholly_inside(
         self, prescription: Prescription, places: Places, *, widen_m: float = -TOUCH_M
     ) -> Bools:
         """Return where the whole strip, widened at both ends, lies in the field."""
         half_m = max(0.5 * self.width_m + widen_m, 0.25 * self.width_m)
+        if len(places.time_s) < PIECES_FROM * PIECE:
+            inside = np.zeros(len(places.time_s), dtype=np.bool_)
+            asked = np.arange(len(inside))
+        else:
+            inside, asked = _inside_by_pieces(prescription, places, half_m)
         deep = sure_field(prescription, half_m)
-        inside = np.asarray(
-            shapely.contains_xy(deep, places.east_m, places.north_m), dtype=np.bool_
-        )
-        doubtful = np.flatnonzero(~inside)
+        inside[asked] = shapely.contains_xy(deep, places.east_m[asked], places.north_m[asked])
+        doubtful = asked[~inside[asked]]
         # Of a strip whose middle is outside nobody has to look at the ends: half of a flight turns.
         near = places.some(doubtful)
         middle_inside = in_field(prescription, near.east_m, near.north_m)
@@ -296,18 +324,45 @@ class Track:
         return in_field(prescription, *places.beside(right_m)) & self.on_line(places)
 
 
+def _inside_by_pieces(
+    prescription: Prescription, places: Places, half_m: float
+) -> tuple[Bools, Ints]:
+    """Return which places are `half_m` inside the field, and those that are to be asked for.
+
+    Far from the border one place says it for a whole piece of a path.
+    """
+    count = len(places.time_s) // PIECE
+    inside = np.zeros(len(places.time_s), dtype=np.bool_)
+    east_m, north_m = (
+        each[: count * PIECE].reshape(count, PIECE) for each in (places.east_m, places.north_m)
+    )
+    middle_e, middle_n = east_m[:, PIECE // 2], north_m[:, PIECE // 2]
+    away = (east_m - middle_e[:, np.newaxis]) ** 2 + (north_m - middle_n[:, np.newaxis]) ** 2
+    is_short = away.max(axis=1, initial=0.0) <= PIECE_REACH_M**2
+    within = shapely.contains_xy(
+        sure_field(prescription, half_m + PIECE_REACH_M), middle_e, middle_n
+    )
+    beyond = ~shapely.contains_xy(sure_field(prescription, -PIECE_REACH_M), middle_e, middle_n)
+    inside[: count * PIECE] = np.repeat(is_short & within, PIECE)
+    asked = np.ones(len(inside), dtype=np.bool_)
+    asked[: count * PIECE] = np.repeat(~(is_short & (within | beyond)), PIECE)
+    return inside, np.flatnonzero(asked)
+
+
 _SURE: WeakKeyDictionary[Prescription, dict[float, shapely.Geometry]] = WeakKeyDictionary()
 
 
 def sure_field(prescription: Prescription, half_m: float) -> shapely.Geometry:
     """Return ground on which a strip of half that width lies in the field, however it is turned.
 
-    Somewhat less than all of it: arcs are made of chords.
+    Somewhat less than all of it: arcs are made of chords. Of less than 0 it is all ground that is
+    so near to the field, and somewhat more.
     """
     known = _SURE.setdefault(prescription, {})
     found = known.get(half_m)
     if found is None:
-        found = known[half_m] = shapely.buffer(prescription.field, -1.01 * half_m - 0.005)
+        by_m = -1.01 * half_m - (0.005 if half_m >= 0.0 else -0.005)
+        found = known[half_m] = shapely.buffer(prescription.field, by_m)
         shapely.prepare(found)
     return found
 

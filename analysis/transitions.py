@@ -7,8 +7,8 @@ missed a change. Everything is volume per metre of track, so that a change of sp
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -46,8 +46,7 @@ SHARP_QUARTERS_PERIODS = 0.68
 MOVED_M = 0.01
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Transition:
+class Transition(NamedTuple):
     """The flow leaves one level after `begin_s` and is at the next one before `settled_s`.
 
     `levels_ml_m` are the doses before and after. `progress` is how much of the prescribed step
@@ -89,6 +88,7 @@ class SmoothTrack:
         moving = rise_m > 0.1 * track.period_s
         self.metres: Floats = np.diff(self.distance_m, append=self.distance_m[-1])
         self.dose_ml_m: Floats = np.divide(rise_ml, rise_m, out=np.zeros_like(rise_m), where=moving)
+        self.is_sound = not np.isnan(self.dose_ml_m).any()
 
     def doses_between(self, start_s: Floats, end_s: Floats) -> Floats:
         """Return the mean doses between pairs of times; 0 where the strip stands."""
@@ -114,65 +114,72 @@ def levels_of(smooth: SmoothTrack, stretches: Sequence[Run]) -> list[float]:
 
 def usual_doses_of(smooth: SmoothTrack, stretches: Sequence[Run]) -> list[float]:
     """Return the dose [mL/m] that the flow mostly had in each stretch; 0 outside the field."""
+    starts_s = np.array([stretch.start_s for stretch in stretches])
+    dwells_s = np.array([stretch.dwell_s for stretch in stretches])
+    firsts = smooth.track.samples(starts_s + LEVEL_FROM * dwells_s).tolist()
+    lasts = smooth.track.samples(starts_s + LEVEL_TO * dwells_s).tolist()
     # A stretch stands behind one change and before the next: its median is worked out once.
     medians: dict[tuple[int, int], float] = {}
     found = []
-    for stretch in stretches:
+    for stretch, first, last in zip(stretches, firsts, lasts, strict=True):
         if not stretch.inside:
             found.append(0.0)
             continue
-        start_s, end_s = (stretch.start_s + at * stretch.dwell_s for at in (LEVEL_FROM, LEVEL_TO))
-        part = (smooth.track.sample(start_s), smooth.track.sample(end_s) + 1)
-        if part not in medians:
-            medians[part] = _median(smooth.dose_ml_m[slice(*part)])
-        found.append(medians[part])
+        level = medians.get((first, last))
+        if level is None:
+            level = medians[first, last] = _median(smooth, first, last + 1)
+        found.append(level)
     return found
 
 
-def _median(values: Floats) -> float:
-    """Return the median as numpy does, in a tenth of its time for some hundred values."""
+def _median(smooth: SmoothTrack, first: int, end: int) -> float:
+    """Return the median dose as numpy does, in a tenth of its time for some hundred values."""
+    values = smooth.dose_ml_m[first:end]
     last = len(values) // 2
-    if not len(values) or np.isnan(values).any():
+    if not len(values) or not (smooth.is_sound or not np.isnan(values).any()):
         return math.nan
+    values = values.copy()
     if len(values) % 2:
-        return float(np.partition(values, last)[last])
-    low, high = np.partition(values, (last - 1, last))[last - 1 : last + 1].tolist()
-    middle: float = 0.5 * (low + high)
-    return middle
+        values.partition(last)
+        return values.item(last)
+    values.partition((last - 1, last))
+    return 0.5 * (values.item(last - 1) + values.item(last))
 
 
-def prescribed_dose_ml_m(track: Track, rate_l_ha: float, time_s: float) -> float:
-    """Return the volume per metre of track that a rate asks of a strip."""
-    return rate_l_ha * track.value(track.across_m, time_s) * ML_M_PER_L_HA_M
+def doses_per_rate_ml_m(track: Track, time_s: Floats) -> Floats:
+    """Return the volume per metre of track that 1 L/ha asks of a strip, at many times."""
+    return track.each_value(track.across_m, time_s) * ML_M_PER_L_HA_M
 
 
 def find_transitions(
     smooth: SmoothTrack, sides: Sequence[Sides], changes: Sequence[Change | None]
 ) -> list[Transition]:
     """Return the transition of each pair of neighbouring stretches."""
-    levels_before = levels_of(smooth, [each.before for each in sides])
-    levels_after = levels_of(smooth, [each.after for each in sides])
-    doses = usual_doses_of(smooth, [run for each in sides for run in (each.before, each.after)])
+    both = [run for each in sides for run in (each.before, each.after)]
+    levels, doses = levels_of(smooth, both), usual_doses_of(smooth, both)
+    places_s = [
+        side.after.start_s if change is None else change.time_s
+        for side, change in zip(sides, changes, strict=True)
+    ]
+    per_rate = doses_per_rate_ml_m(smooth.track, np.array(places_s)).tolist()
     found: list[Transition] = []
-    for i, change in enumerate(changes):
+    for i, (change, at_s) in enumerate(zip(changes, places_s, strict=True)):
         before, after = sides[i].before, sides[i].after
         early_s = max(before.start_s, before.end_s - SEARCH_BEFORE_S)
         if found:
             early_s = max(early_s, found[-1].middle_s)
         late_s = after.start_s + 0.5 * after.dwell_s if not after.inside else after.end_s
-        pair = (levels_before[i], levels_after[i])
-        at_s = after.start_s if change is None else change.time_s
+        pair = (levels[2 * i], levels[2 * i + 1])
         if change is None or sides[i].held:
             found.append(_nominal(smooth.track, at_s, 0.0, pair))
             continue
-        asked = prescribed_dose_ml_m(smooth.track, 1.0, at_s)
-        asked *= after.rate_l_ha - before.rate_l_ha
+        asked = per_rate[i] * (after.rate_l_ha - before.rate_l_ha)
         progress = (pair[1] - pair[0]) / asked
         if progress > 0.0 and late_s - early_s > smooth.track.step_s:
             usual = (doses[2 * i], doses[2 * i + 1])
             is_told = (usual[1] - usual[0]) / asked >= USUAL_STEP_MIN
-            located = _located(smooth, usual if is_told else pair, early_s, late_s)
-            found.append(replace(located, progress=progress, levels_ml_m=pair))
+            times_s = _located(smooth, usual if is_told else pair, early_s, late_s)
+            found.append(Transition(*times_s, progress, pair, found=True))
         else:
             found.append(_nominal(smooth.track, at_s, progress, pair))
     return found
@@ -192,8 +199,8 @@ def _nominal(track: Track, at_s: float, progress: float, levels: tuple[float, fl
 
 def _located(
     smooth: SmoothTrack, levels: tuple[float, float], early_s: float, late_s: float
-) -> Transition:
-    """Return the transition between two levels in a span of time.
+) -> tuple[float, float, float]:
+    """Return when the transition between two levels in a span of time begins, is, and has settled.
 
     Its middle is the change point of greatest likelihood for known levels: where the integral of
     what the flow has done of the step, less one half, is least. Clipped to the two levels, so that
@@ -216,14 +223,8 @@ def _located(
         sharp_s = _quarters_s(span_s, part, middle, early_s, late_s)
         if not _slow_s(track, *sharp_s) > 0.0:
             (low_s, high_s), slow_s = sharp_s, 0.0
-    return Transition(
-        begin_s=low_s - 0.35 * track.period_s - slow_s,
-        middle_s=middle_s,
-        settled_s=high_s + 1.35 * track.period_s + 3.0 * slow_s,
-        progress=1.0,
-        levels_ml_m=levels,
-        found=True,
-    )
+    begin_s = low_s - 0.35 * track.period_s - slow_s
+    return begin_s, middle_s, high_s + 1.35 * track.period_s + 3.0 * slow_s
 
 
 def _quarters_s(

@@ -7,6 +7,7 @@ of rate or of speed; a flight should know the same of itself.
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
 from enum import StrEnum
@@ -468,11 +469,18 @@ class Marks:
 
     def is_inhibited(self, flight: AppliedFlight) -> Bools:
         """Return where a reason not to spray held the valve, or had until a moment ago."""
-        held = np.array([bool(reasons) for reasons in flight.inhibits], dtype=np.bool_)
+        held = np.array(list(map(bool, flight.inhibits)), dtype=np.bool_)
+        edges = np.flatnonzero(np.diff(held, prepend=False, append=False))
+        # As `samples_at`: the first sample counts before it, too, and the last one for good.
+        edges_s = np.concatenate((flight.time_s, [math.inf]))[edges]
+        edges_s[edges == 0] = -math.inf
         lead_s = flight.setup.lag.off_s + flight.setup.lag.output_s
         found = np.zeros(len(self.time_s), dtype=np.bool_)
         for back_s in (0.0, 0.5 * lead_s, lead_s, lead_s + INHIBIT_TAIL_S):
-            found |= held[samples_at(flight, self.time_s - back_s)]
+            # Few edges are sought among many marks, not each mark among the samples.
+            at = np.searchsorted(self.time_s - back_s, edges_s).tolist()
+            for first, end in zip(at[::2], at[1::2], strict=True):
+                found[first:end] = True
         return found
 
 

@@ -56,8 +56,12 @@ class SquareGrid:
         """Return the number of each point's cell; rows x columns beside the grid."""
         column = np.floor((east_m - self.west_m) / self.cell_m).astype(np.int64)
         row = np.floor((north_m - self.south_m) / self.cell_m).astype(np.int64)
-        inside = (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
-        return np.where(inside, row * self.columns + column, self.rows * self.columns)
+        # Without a sign what lies before the first is far behind the last.
+        beside = (column.view(np.uint64) >= self.columns) | (row.view(np.uint64) >= self.rows)
+        row *= self.columns
+        row += column
+        row[beside] = self.rows * self.columns
+        return row
 
     def corners(self) -> tuple[Floats, Floats]:
         """Return east and north of the cells' corners: (rows + 1, columns + 1) each."""
@@ -113,9 +117,19 @@ def slices_of(strip: Strip, length_m: float) -> Slices:
     ends = np.concatenate(
         ([0], np.searchsorted(track.distance_m, wanted), [len(track.distance_m) - 1])
     )
-    turns_s = np.array([run.start_s for run in strip.stretches[1:]])
-    ends_s = np.unique(np.concatenate((track.time_s[ends], turns_s)))
-    metres = np.diff(track.at(track.distance_m, ends_s))
+    ends = ends[np.diff(ends, prepend=-1) > 0]
+    samples_s = track.time_s[ends]
+    # The few turns are put between the samples, whose values are known.
+    turns_s = np.unique([run.start_s for run in strip.stretches[1:]])
+    places = np.searchsorted(samples_s, turns_s)
+    is_between = samples_s[np.minimum(places, len(samples_s) - 1)] != turns_s
+    turns_s, places = turns_s[is_between], places[is_between]
+    ends_s = np.insert(samples_s, places, turns_s)
+
+    def at_ends(values: Floats) -> Floats:
+        return np.insert(values[ends], places, track.at(values, turns_s))
+
+    metres = np.diff(at_ends(track.distance_m))
     kept = metres > 0.0
     middle_s = 0.5 * (ends_s[1:] + ends_s[:-1])[kept]
     area_m2 = track.at(track.across_m, middle_s) * metres[kept]
@@ -126,7 +140,7 @@ def slices_of(strip: Strip, length_m: float) -> Slices:
         track=track,
         time_s=middle_s,
         area_m2=area_m2,
-        given_ml=np.diff(track.at(track.volume_ml, ends_s))[kept],
+        given_ml=np.diff(at_ends(track.volume_ml))[kept],
         asked_ml=strip.rates_at(middle_s) * ML_M_PER_L_HA_M * area_m2,
         inside=inside[under],
     )

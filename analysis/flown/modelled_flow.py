@@ -77,10 +77,11 @@ def valve_flows(
     flows = []
     for valve, lag in enumerate(lags):
         its = changes.valve == valve
-        rests = (
-            [timings[valve].rest_s(duty) for duty in changes.duty[its].tolist()] if timings else []
-        )
-        flows.append(ramped(order_s[its], levels[its], lag, np.array(rests or 0.0)))
+        rest_s: Floats | float = 0.0
+        # No other output lets a valve rest, whatever the duty.
+        if timings and timings[valve].centred is not None:
+            rest_s = np.array([timings[valve].rest_s(each) for each in changes.duty[its].tolist()])
+        flows.append(ramped(order_s[its], levels[its], lag, rest_s))
     return flows
 
 
@@ -97,8 +98,10 @@ def levels_ml_s(changes: ValveChanges, nozzle_sets: Sequence[NozzleSet]) -> Floa
     levels = np.zeros(len(changes.duty))
     for i, nozzles in enumerate(by_size):
         its = (number == i) & np.isin(changes.valve, nozzles.valves)
-        shares = np.array([nozzles.share(valve) for valve in changes.valve[its].tolist()])
-        levels[its] = flow_of(nozzles, changes.duty[its]) * shares / len(nozzles.valves)
+        shares = np.ones(max(nozzles.valves) + 1)
+        shares[list(nozzles.valves)] = [nozzles.share(valve) for valve in nozzles.valves]
+        own = shares[changes.valve[its]]
+        levels[its] = flow_of(nozzles, changes.duty[its]) * own / len(nozzles.valves)
     return levels
 
 

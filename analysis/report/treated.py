@@ -86,17 +86,14 @@ def open_spans(flight: AppliedFlight, valve: int) -> Iterator[tuple[float, float
     lag, changes = flight.setup.lag, flight.changes
     mine = changes.valve == valve
     at_s = np.where(np.isfinite(changes.actual_s), changes.actual_s, changes.planned_s)[mine]
-    opened_s: float | None = None
-    for time_s, duty in zip(at_s.tolist(), changes.duty[mine].tolist(), strict=True):
-        if duty > 0.0 and opened_s is None:
-            opened_s = time_s + lag.on_s + lag.output_s
-        elif not duty > 0.0 and opened_s is not None:
-            closed_s = time_s + lag.off_s + lag.output_s
-            if closed_s > opened_s:
-                yield opened_s, closed_s
-            opened_s = None
-    if opened_s is not None and len(flight.time_s) and flight.time_s[-1] > opened_s:
-        yield opened_s, float(flight.time_s[-1])
+    edges = np.flatnonzero(np.diff(changes.duty[mine] > 0.0, prepend=False))
+    opens_s = (at_s[edges[::2]] + lag.on_s + lag.output_s).tolist()
+    closes_s = (at_s[edges[1::2]] + lag.off_s + lag.output_s).tolist()
+    if len(opens_s) > len(closes_s):
+        closes_s.append(float(flight.time_s[-1]) if len(flight.time_s) else -math.inf)
+    for opened_s, closed_s in zip(opens_s, closes_s, strict=True):
+        if closed_s > opened_s:
+            yield opened_s, closed_s
 
 
 def _headings(flight: AppliedFlight) -> Floats | None:
@@ -115,7 +112,11 @@ def _headings(flight: AppliedFlight) -> Floats | None:
 def _strip(
     flight: AppliedFlight, heading_deg: Floats, valve: Valve, begin_s: float, end_s: float
 ) -> BaseGeometry | None:
-    inner = flight.time_s[(flight.time_s > begin_s) & (flight.time_s < end_s)]
+    first, last = (
+        np.searchsorted(flight.time_s, begin_s, "right"),
+        flight.time_s.searchsorted(end_s),
+    )
+    inner = flight.time_s[first:last]
     at_s = np.concatenate([[begin_s], inner, [end_s]])
     east_m = np.interp(at_s, flight.time_s, flight.east_m)
     north_m = np.interp(at_s, flight.time_s, flight.north_m)
