@@ -14,6 +14,8 @@ import ast
 import sys
 import tomllib
 from collections import defaultdict
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -140,17 +142,25 @@ def private_imports(files: dict[str, Path]) -> list[str]:
     """Return where a module imports what another keeps to itself: a name, or a whole module."""
     found = []
     for user, path in files.items():
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            names = []
-            if isinstance(node, ast.Import):
-                names = [alias.name for alias in node.names]
-            elif isinstance(node, ast.ImportFrom):
-                names = [f"{node.module}.{alias.name}" for alias in node.names]
-            for name in names:
-                top, *parts = name.split(".")
-                if top in PACKAGES and any(_is_private(part) for part in parts):
-                    found.append(f"{user}: imports {name}, which is private")
+        for name in imports(path.read_text(encoding="utf-8")):
+            top, *parts = name.split(".")
+            if top in PACKAGES and any(_is_private(part) for part in parts):
+                found.append(f"{user}: imports {name}, which is private")
     return found
+
+
+@cache
+def imports(source: str) -> tuple[str, ...]:
+    """Return the full name of all that a source imports, wherever it does so."""
+    return tuple(_imports(source))
+
+
+def _imports(source: str) -> Iterator[str]:
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
 def _is_private(name: str) -> bool:

@@ -27,6 +27,8 @@ from tests.bench.missions import FRAME, to_degrees
 from tests.mission_fields import trees
 from tests.mission_flight import Way, flown_s
 
+pytestmark = pytest.mark.usefixtures("searched_briefly")
+
 SETTINGS = Settings(swath_width_m=6.0, speed_m_s=6.0, moves=500)
 Line = tuple[Place, Place]
 

@@ -25,6 +25,8 @@ from missions.plan import Plan, Settings
 from missions.searching import Watch, lines_are_drawn, steps, watched
 from tests.mission_fields import degrees
 
+pytestmark = pytest.mark.usefixtures("searched_briefly")
+
 SAID = "wrote the best plan so far"
 
 
@@ -122,6 +124,7 @@ def plan_small(folder: Path, *given: str) -> tuple[int, Path]:
     field, out = folder / "field.geojson", folder / "out.geojson"
     field.write_text(shapely.to_geojson(degrees(SMALL)), encoding="utf-8")
     asked = ["--swath-m", "6", "--speed-m-s", "6", "--rate-l-ha", "20", "--json", *given]
+    asked += ["--effort", "quick"]
     return app.execute(["plan", "--force", str(field), "--out", str(out), *asked]), out
 
 
@@ -192,7 +195,7 @@ def test_a_cap_that_changes_no_line_is_not_lowered_again(
 ) -> None:
     made = plans_made(monkeypatch)
     # All ground is to be covered but 1 %, whatever falls twice.
-    plan_small(tmp_path, "--overlap-max", "0.1", "--leave-max", "1", "--effort", "quick")
+    plan_small(tmp_path, "--overlap-max", "0.1", "--leave-max", "1")
     capsys.readouterr()
     asked = [each for each in made if each.leave_max_percent == 1.0]
     assert [each.overlap_max_percent is None for each in asked] == [False, False, True]

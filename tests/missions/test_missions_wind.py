@@ -100,6 +100,7 @@ def config_with(tmp_path: Path, lines: str) -> Path:
     return path
 
 
+@pytest.mark.usefixtures("searched_briefly")
 def test_the_wind_of_the_command_widens_the_configured_buffers(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 
 import pytest
 
 from tests import house as rules
 from tests.bench import house
+from tests.house import imports
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("companion", "missions", "sitl", "analysis")
@@ -40,20 +39,6 @@ PURE = {
     "__future__", "bisect", "collections", "dataclasses", "enum", "functools", "heapq",
     "itertools", "math", "operator", "statistics", "typing",
 }  # fmt: skip
-
-
-@cache
-def imports(source: str) -> tuple[str, ...]:
-    """Return the full name of all that a source imports, wherever it does so."""
-    return tuple(_imports(source))
-
-
-def _imports(source: str) -> Iterator[str]:
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
 def relative(path: Path) -> str:
@@ -88,25 +73,29 @@ def test_mavutil_is_imported_nowhere() -> None:
 
 def test_the_companion_names_no_module_of_the_office_in_a_string_either() -> None:
     named = re.compile(r"(missions|analysis|sitl)([.:]\w+)+")
-    found = [
-        f"{relative(path)}:{node.lineno}: {node.value}"
+    nodes = [
+        (path, node)
         for path in (ROOT / "companion").rglob("*.py")
         for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Constant | ast.Call)
+    ]
+    found = [
+        f"{relative(path)}:{node.lineno}: {node.value}"
+        for path, node in nodes
         if isinstance(node, ast.Constant)
         and isinstance(node.value, str)
         and named.fullmatch(node.value)
     ]
     found += [
         f"{relative(path)}:{node.lineno}: {ast.unparse(node)}"
-        for path in (ROOT / "companion").rglob("*.py")
-        for node in ast.walk(ast.parse(path.read_text()))
+        for path, node in nodes
         if isinstance(node, ast.Call)
-        and ast.unparse(node.func).rpartition(".")[2]
-        in ("find_spec", "import_module", "__import__")
         and any(
             isinstance(given, ast.Constant) and given.value in ("missions", "analysis", "sitl")
             for given in node.args
         )
+        and ast.unparse(node.func).rpartition(".")[2]
+        in ("find_spec", "import_module", "__import__")
     ]
     assert found == []
 
