@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
@@ -28,7 +29,7 @@ from missions.maps.local import Area, as_area, polygons_of
 from missions.strips import Floats
 
 Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
+Bytes = NDArray[np.uint8]
 
 # New corners lie so deep inside, in parts of the tolerance: 0 keeps a corner where it was drawn.
 DEPTHS = np.array([0.0, 0.1, 0.25, 0.5, 0.75, 1.0])
@@ -39,8 +40,8 @@ STARTS = (0, 2)
 DEPTH_COST = 0.125
 # From so many corners at once as many points ahead are looked at, and then twice as many.
 TOGETHER, AHEAD = 64, 8
-# Rings of as many corners are drawn together, so many corners of them.
-ROWS = 512
+# Rings of nearly as many corners are drawn together, so many corners of them.
+ROWS, ALIKE = 512, 0.5
 # Rounding of angles [rad]: 1e-9 is a micrometre over a kilometre. The caller keeps a margin.
 ROUNDING = 1e-9
 TURN = 2.0 * math.pi
@@ -91,7 +92,7 @@ def _shells(
     points = [_points(ring, clockwise=not inwards) for ring in rings]
     found = list(given)
     left = list(range(len(rings)))
-    for _ in range(TRIED_MAX):
+    for _ in range(TRIED_MAX if rings else 0):
         drawn = _rings([points[at] for at in left], tolerance_m)
         fitting = (
             _fitting(given[at], points[at], corners, tolerance_m, inwards=inwards)
@@ -103,6 +104,8 @@ def _shells(
                 left.append(at)
             else:
                 found[at] = polygon
+        if not left:
+            break
         # Borders that nearly touch, and corners like needles.
         tolerance_m *= LESS
     return found
@@ -131,7 +134,7 @@ def _points(ring: shapely.LinearRing, *, clockwise: bool) -> Floats:
     points = shapely.get_coordinates(ring)[:-1]
     if shapely.is_ccw(ring) == clockwise:
         points = points[::-1]
-    far = np.hypot(*(points - np.roll(points, 1, axis=0)).T) > SAME_M
+    far = np.hypot(*(points - points[_from(-1, len(points))]).T) > SAME_M
     kept: Floats = points[far]
     return kept
 
@@ -139,22 +142,25 @@ def _points(ring: shapely.LinearRing, *, clockwise: bool) -> Floats:
 def _rings(rings: Sequence[Floats], tolerance_m: float) -> list[Floats]:
     """Return the corners of each ring with the fewest edges.
 
-    Trees are many rings of as many corners: those are drawn together, which takes a fraction of
-    the time.
+    Trees are many rings of nearly as many corners: those are drawn together, which takes a fraction
+    of the time.
     """
     found = list(rings)
-    alike: dict[int, list[int]] = {}
-    for at, points in enumerate(rings):
-        if len(points) > 4:
-            alike.setdefault(len(points), []).append(at)
-    for count, each in alike.items():
-        many = max(ROWS // min(count, TOGETHER), 1)
-        for first in range(0, len(each), many):
-            some = each[first : first + many]
-            closed, inwards = zip(*(_from_sharpest(rings[at]) for at in some), strict=True)
-            drawn = _cheapest(np.stack(closed), np.stack(inwards), tolerance_m)
-            for at, corners in zip(some, drawn, strict=True):
-                found[at] = corners
+    left = sorted(
+        (at for at, points in enumerate(rings) if len(points) > 4), key=lambda at: -len(rings[at])
+    )
+    while left:
+        most = len(rings[left[0]])
+        some = [
+            at
+            for at in left[: max(ROWS // min(most, TOGETHER), 1)]
+            if len(rings[at]) >= ALIKE * most
+        ]
+        left = left[len(some) :]
+        closed, inwards = zip(*(_from_sharpest(rings[at]) for at in some), strict=True)
+        drawn = _cheapest(_Rings.of(closed, inwards, tolerance_m))
+        for at, corners in zip(some, drawn, strict=True):
+            found[at] = corners
     return found
 
 
@@ -163,20 +169,25 @@ def _from_sharpest(points: Floats) -> tuple[Floats, Floats]:
 
     Its start stays where a corner is.
     """
-    edges = np.roll(points, -1, axis=0) - points
+    edges = points[_from(1, len(points))] - points
     course = np.arctan2(edges[:, 1], edges[:, 0])
-    turn = (course - np.roll(course, 1) + math.pi) % (2.0 * math.pi) - math.pi
+    turn = (course - course[_from(-1, len(points))] + math.pi) % (2.0 * math.pi) - math.pi
     start = int(np.argmax(np.abs(turn)))
-    points, turn, edges = (np.roll(each, -start, axis=0) for each in (points, turn, edges))
-    inwards = _inwards(edges, turn)
-    return np.vstack([points, points[:1]]), np.vstack([inwards, inwards[:1]])
+    around = np.append(_from(start, len(points)), start)
+    return points[around], _inwards(edges, turn)[around]
+
+
+def _from(start: int, count: int) -> Ints:
+    """Return the numbers of the corners of a ring from one of them on."""
+    found: Ints = np.arange(start, start + count) % count
+    return found
 
 
 def _inwards(edges: Floats, turn: Floats) -> Floats:
     """Return the way from each corner to the place one metre inside of both of its edges."""
     unit = edges / np.hypot(*edges.T)[:, None]
     normal = np.column_stack([-unit[:, 1], unit[:, 0]])
-    both = normal + np.roll(normal, 1, axis=0)
+    both = normal + normal[_from(-1, len(normal))]
     length = np.hypot(*both.T)
     mitre = 1.0 / np.maximum(np.cos(turn / 2.0), 1e-9)
     flat: Floats = np.where(
@@ -185,108 +196,168 @@ def _inwards(edges: Floats, turn: Floats) -> Floats:
     return flat
 
 
-def _cheapest(closed: Floats, inwards: Floats, tolerance_m: float) -> list[Floats]:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Rings:
+    """Closed rings with the places at which new corners may lie, by ring, corner and depth.
+
+    One that has fewer corners than others stays at its last one, which is its first.
+    """
+
+    closed: Floats
+    places: Floats
+    counts: Ints
+    tolerance_m: float
+
+    @classmethod
+    def of(cls, closed: Sequence[Floats], inwards: Sequence[Floats], tolerance_m: float) -> _Rings:
+        counts = np.array([len(each) - 1 for each in closed])
+        at = np.minimum(np.arange(counts.max() + 1), counts[:, None])
+        corners = np.stack([each[some] for each, some in zip(closed, at, strict=True)])
+        inside = np.stack([each[some] for each, some in zip(inwards, at, strict=True)])
+        # The mitre of a sharp corner is cut off: no place is farther from its corner.
+        steep = np.maximum(np.hypot(inside[..., 0], inside[..., 1]), 1.0)[..., None]
+        deep = np.minimum(DEPTHS, 1.0 / steep) * tolerance_m
+        places = corners[:, :, None, :] + inside[:, :, None, :] * deep[..., None]
+        return cls(closed=corners, places=places, counts=counts, tolerance_m=tolerance_m)
+
+
+# What leaves out the depths that are not in a set of them, for each set; a bit stands for each.
+_BITS = np.array(1 << np.arange(len(DEPTHS)), dtype=np.uint8)
+_SETS = 1 << len(DEPTHS)
+_LEFT_OUT = np.where(np.arange(_SETS) & _BITS[:, None], 0.0, np.inf)
+_EDGE = 1.0 + DEPTH_COST * DEPTHS
+
+
+def _cheapest(rings: _Rings) -> list[Floats]:
     """Return the corners of the cheapest rings; where there is none, the corners given."""
-    rings, count, depths = len(closed), closed.shape[1] - 1, len(DEPTHS)
-    # The mitre of a sharp corner is cut off: no place is farther from its corner.
-    steep = np.maximum(np.hypot(inwards[..., 0], inwards[..., 1]), 1.0)[..., None]
-    deep = np.minimum(DEPTHS, 1.0 / steep) * tolerance_m
-    places = closed[:, :, None, :] + inwards[:, :, None, :] * deep[..., None]
+    many, size, depths = len(rings.closed), rings.closed.shape[1], len(DEPTHS)
     # One row for each depth at which a ring may begin.
-    cost = np.full((rings, len(STARTS), count + 1, depths), np.inf)
-    cost[:, np.arange(len(STARTS)), 0, STARTS] = 0.0
-    before = np.full(cost.shape, -1, dtype=np.int64)
-    for at, edges in _seen(closed, places, tolerance_m):
-        spent = edges[:, None] + cost[:, :, at, :, None, None]
-        least = spent.min(axis=2)
-        ends = slice(at + 1, at + 1 + edges.shape[2])
-        better = least < cost[:, :, ends] - 1e-12
-        if better.any():
-            np.copyto(cost[:, :, ends], least, where=better)
-            np.copyto(before[:, :, ends], at * depths + spent.argmin(axis=2), where=better)
-    cost_of = cost[:, np.arange(len(STARTS)), count, STARTS]
+    cost = np.full((len(STARTS), many, size, depths), np.inf)
+    cost[np.arange(len(STARTS)), :, 0, STARTS] = 0.0
+    # Where the edge to each place begins: at which corner, and at one of which depths.
+    before, from_set = np.zeros(cost.shape, dtype=np.int64), np.zeros(cost.shape, dtype=np.uint8)
+    least = np.empty((len(STARTS), many * _SETS))
+    for at, sets, row in _seen(rings):
+        over = cost[:, :, at, :, None] + _LEFT_OUT
+        np.minimum.reduce(over, axis=2, out=least.reshape(len(STARTS), many, _SETS))
+        spent = least.take(row, axis=1, mode="clip")
+        spent += _EDGE
+        ends = slice(at + 1, at + 1 + sets.shape[1])
+        better = spent < cost[:, :, ends] - 1e-12
+        np.copyto(cost[:, :, ends], spent, where=better)
+        np.copyto(before[:, :, ends], at, where=better)
+        np.copyto(from_set[:, :, ends], sets, where=better)
     found = []
-    for ring, row in enumerate(cost_of.argmin(axis=1).tolist()):
-        if not math.isfinite(cost_of[ring, row]):
-            found.append(closed[ring, :-1])
+    for ring, count in enumerate(rings.counts.tolist()):
+        cost_of = cost[np.arange(len(STARTS)), ring, count, STARTS]
+        start = int(cost_of.argmin())
+        if not math.isfinite(cost_of[start]):
+            found.append(rings.closed[ring, :count])
             continue
-        node, chain = count * depths + STARTS[row], list[int]()
-        while node >= depths or not chain:
-            node = int(before[ring, row].flat[node])
-            chain.append(node)
-        found.append(places[ring].reshape(-1, 2)[chain[::-1]])
+        way = _chain(
+            cost[start, ring], before[start, ring], from_set[start, ring], count, STARTS[start]
+        )
+        found.append(rings.places[ring, way[:, 0], way[:, 1]])
     return found
 
 
-def _seen(closed: Floats, places: Floats, tolerance_m: float) -> Iterator[tuple[int, Floats]]:
-    """Yield each corner with what edges from it to places ahead cost, infinite where none may be.
+def _chain(cost: Floats, before: Ints, from_set: Bytes, corner: int, depth: int) -> Ints:
+    """Return the corners and depths of a ring from its end back to its start, the start first."""
+    found = list[tuple[int, int]]()
+    while corner:
+        one = int(before[corner, depth])
+        spent = cost[one] + _EDGE[depth] + _LEFT_OUT[:, from_set[corner, depth]]
+        corner, depth = one, int(spent.argmin())
+        found.append((corner, depth))
+    return np.array(found[::-1])
 
-    It is by ring, the depth of its start, how many corners ahead it ends, and the depth there.
+
+def _seen(rings: _Rings) -> Iterator[tuple[int, Bytes, Ints]]:
+    """Yield each corner with the sets of depths from which edges to places ahead may begin.
+
+    They are by ring, how many corners ahead an edge ends, and the depth there; once more as rows
+    of a table with all sets of each ring.
     """
-    rings, count = len(closed), closed.shape[1] - 1
-    edge = 1.0 + DEPTH_COST * DEPTHS
-    for first in range(0, count, TOGETHER):
-        starts = np.arange(first, min(first + TOGETHER, count))
-        possible = _ahead(closed, places, starts, tolerance_m)
-        possible = possible.reshape(rings, len(starts), *possible.shape[1:])
-        beyond = starts[:, None] + np.arange(possible.shape[3]) >= count
-        is_end = possible.any(axis=(0, 2, 4)) & ~beyond
-        farthest = possible.shape[3] - is_end[:, ::-1].argmax(axis=1)
-        costs = np.where(possible, edge, np.inf)
+    many, size = rings.closed.shape[:2]
+    own = _SETS * np.arange(many)[:, None, None, None]
+    for first in range(0, size - 1, TOGETHER):
+        starts = np.arange(first, min(first + TOGETHER, size - 1))
+        sets = _ahead(rings, starts)
+        sets = sets.reshape(many, len(starts), *sets.shape[1:])
+        rows = sets + own
+        is_end = sets.max(axis=(0, 3)) > 0
+        farthest = sets.shape[2] - is_end[:, ::-1].argmax(axis=1)
         for at in np.flatnonzero(is_end.any(axis=1)).tolist():
-            yield first + at, costs[:, at, :, : farthest[at]]
+            some = slice(farthest[at])
+            yield first + at, sets[:, at, some], rows[:, at, some]
 
 
-def _ahead(closed: Floats, places: Floats, starts: Ints, tolerance_m: float) -> Bools:
+def _ahead(rings: _Rings, starts: Ints) -> Bytes:
     """Return from which depths of some corners edges to corners ahead may end at which depth.
 
     Corners of all rings are looked at together, the nearest first, as long as any of them is seen.
     """
-    rings, count = len(closed), closed.shape[1] - 1
+    counts, size = rings.counts, rings.closed.shape[1]
+    east_m, north_m = (rings.places[..., axis].reshape(-1, len(DEPTHS)) for axis in (0, 1))
     found = []
-    ring, at = np.repeat(np.arange(rings), len(starts)), np.tile(starts, rings)
-    some = np.arange(len(at))
+    ring, at = np.repeat(np.arange(len(counts)), len(starts)), np.tile(starts, len(counts))
     total = len(at)
-    onward = np.arctan2(*(closed[ring, at + 1] - closed[ring, at]).T[::-1])
-    low = np.full((len(at), len(DEPTHS)), -math.inf)
+    some = np.flatnonzero(at < counts[ring])
+    ring, at = ring[some], at[some]
+    onward = np.arctan2(*(rings.closed[ring, at + 1] - rings.closed[ring, at]).T[::-1])
+    low = np.full((len(DEPTHS), len(at)), -math.inf)
     high = -low
     ahead, many = 1, AHEAD
     while len(at):
+        ends = at[:, None] + np.arange(ahead, ahead + many)
+        is_there = ends <= counts[ring, None]
         # Beyond the last corner it is looked at again: nothing comes after it.
-        ends = np.minimum(at[:, None] + np.arange(ahead, ahead + many), count)
-        least, most = _sectors(closed[ring[:, None], ends], places[ring, at], onward, tolerance_m)
+        ends = np.minimum(ends, counts[ring, None])
+        least, most = _sectors(rings, ring, at, ends, onward)
         least = np.maximum(np.maximum.accumulate(least, axis=2), low[:, :, None])
         most = np.minimum(np.minimum.accumulate(most, axis=2), high[:, :, None])
-        possible = np.zeros((total, *least.shape[1:], len(DEPTHS)), dtype=np.bool_)
+        sets = np.zeros((total, many, len(DEPTHS)), dtype=np.uint8)
+        low_all, high_all = least - ROUNDING, most + ROUNDING
         # Courses are dear: they are asked for only where there are any that an edge may have.
-        row, depth, end = np.nonzero(least - ROUNDING <= most + ROUNDING)
-        low_some, high_some = least[row, depth, end, None], most[row, depth, end, None]
-        course, far_m = _courses(
-            places[ring[row], ends[row, end]],
-            places[ring[row], at[row], depth, None],
-            onward[row, None],
-        )
-        possible[some[row], depth, end] = (
-            (course >= low_some - ROUNDING) & (course <= high_some + ROUNDING) & (far_m > SAME_M)
-        )
-        found.append(possible)
+        row, near = np.nonzero((low_all <= high_all).any(axis=0) & is_there)
+        here, there = (ring * size + at)[row], (ring * size)[row] + ends[row, near]
+        to_east_m, to_north_m = east_m.take(there, axis=0), north_m.take(there, axis=0)
+        sets_of = np.zeros(to_east_m.shape, dtype=np.uint8)
+        for depth, bit in enumerate(_BITS):
+            east, north = (
+                to_east_m - east_m[here, depth, None],
+                to_north_m - north_m[here, depth, None],
+            )
+            course = _courses(east, north, onward[row, None])
+            fits = course >= low_all[depth, row, near, None]
+            fits &= course <= high_all[depth, row, near, None]
+            fits &= east * east + north * north > SAME_M**2
+            sets_of |= fits.view(np.uint8) * bit
+        sets[some[row], near] = sets_of
+        found.append(sets)
         ahead, many = ahead + many, 2 * many
         low, high = least[:, :, -1], most[:, :, -1]
-        on = (low <= high).any(axis=1) & (at + ahead <= count)
-        some, ring, at = some[on], ring[on], at[on]
-        onward, low, high = onward[on], low[on], high[on]
-    return np.concatenate(found, axis=2)
+        on = (low <= high).any(axis=0) & (at + ahead <= counts[ring])
+        some, ring, at, onward = some[on], ring[on], at[on], onward[on]
+        low, high = low[:, on], high[:, on]
+    return np.concatenate(found, axis=1)
 
 
 def _sectors(
-    points: Floats, starts: Floats, onward: Floats, tolerance_m: float
+    rings: _Rings, ring: Ints, at: Ints, ends: Ints, onward: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the courses that leave each point to the right, by the tolerance at most."""
-    course, far_m = _courses(points[:, None], starts[:, :, None], onward[:, None, None])
+    """Return the courses that leave each point to the right, by the tolerance at most.
+
+    They are by the depth of the start, the start, and the end.
+    """
+    points, starts = rings.closed[ring[:, None], ends], rings.places[ring, at].transpose(2, 1, 0)
+    east_m, north_m = (points[..., axis] - starts[axis, ..., None] for axis in (0, 1))
+    course = _courses(east_m, north_m, onward[:, None])
+    far_m = np.sqrt(east_m * east_m + north_m * north_m)
     wide = np.where(
-        far_m <= tolerance_m,
+        far_m <= rings.tolerance_m,
         math.pi,
-        np.arcsin(np.minimum(tolerance_m / np.maximum(far_m, 1e-12), 1.0)),
+        np.arcsin(np.minimum(rings.tolerance_m / np.maximum(far_m, 1e-12), 1.0)),
     )
     is_same = far_m <= SAME_M
     return (
@@ -295,14 +366,12 @@ def _sectors(
     )
 
 
-def _courses(points: Floats, starts: Floats, onward: Floats) -> tuple[Floats, Floats]:
-    """Return the course to points from starts, from the course onward, and how far they are."""
-    way = points - starts
-    east_m, north_m = way[..., 0], way[..., 1]
-    course = np.arctan2(north_m, east_m) - onward + math.pi
+def _courses(east_m: Floats, north_m: Floats, onward: Floats) -> Floats:
+    """Return the course of ways, from the course onward."""
+    course: Floats = np.arctan2(north_m, east_m) - onward + math.pi
     # The remainder of two half turns, in a fraction of its time.
     course += TURN * ((course < 0.0) * 1.0 - (course >= TURN))
-    return course - math.pi, np.hypot(east_m, north_m)
+    return course - math.pi
 
 
 # Smaller ground is rounding: it is not looked at whether that is allowed.
