@@ -230,7 +230,7 @@ async def no_task_left_behind(no_thread_left_behind: None) -> AsyncIterator[None
 
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
     """Fly what flies in real time by a clock that stands while the computer holds it up."""
-    if "realtime" not in item.path.parts:
+    if "realtime" not in item.path.parts or item.get_closest_marker("browser") is not None:
         return None
     from tests import fair_time
 

@@ -24,6 +24,7 @@ from tests.companion.realtime.test_operators_page import (
 from tests.companion.web_site import Site, served, until
 
 pytestmark = [
+    pytest.mark.browser,
     pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium"),
     pytest.mark.asyncio(loop_scope="module"),
     pytest.mark.timeout(300),

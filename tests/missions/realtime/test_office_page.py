@@ -25,7 +25,10 @@ from tests.companion.realtime.test_operators_page import (
 )
 from tests.companion.web_site import Site, served
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium"),
+]
 ANYANG = Path(__file__).resolve().parents[3] / "examples" / "anyang"
 FOUR_LINES = re.compile(r"^([^\n]+\n){3}[^\n]+$")
 FILES = [*sorted(ANYANG.glob("prescription.*")), ANYANG / "boundary.geojson"]

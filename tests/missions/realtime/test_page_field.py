@@ -46,6 +46,7 @@ from tests.sitl.stub_bench import HOME
 pytest.importorskip("mavsdk.asyncio")
 pytestmark = [
     pytest.mark.sitl,
+    pytest.mark.browser,
     pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium"),
 ]
 # Two passes of 6 m over two zones; the vehicle stands south of it.
