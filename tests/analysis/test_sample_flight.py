@@ -109,16 +109,21 @@ def shallow(setup: Setup) -> list[Line]:
 ROUTES = {"busy": busy, "dry": dry, "shallow": shallow}
 
 
+@cache
+def flown(samples: Path, name: str, seed: int, fidelity: Fidelity) -> FlightRecord:
+    """Fly a route over the real map; two tests ask of the same flight."""
+    setup = real_setup(samples)
+    return fly_route(setup, route_of(ROUTES[name](setup)), seed=seed, fidelity=fidelity).record
+
+
 @pytest.mark.parametrize("name", ROUTES)
 @pytest.mark.parametrize(("seed", "fidelity"), [(1, "averaged"), (2, "averaged"), (3, "pulsed")])
 def test_nothing_falls_outside_the_border_and_in_holes_of_a_real_map(
     samples: Path, name: str, seed: int, fidelity: Fidelity
 ) -> None:
-    setup = real_setup(samples)
-    route = route_of(ROUTES[name](setup))
-    record = fly_route(setup, route, seed=seed, fidelity=fidelity).record
+    record = flown(samples, name, seed, fidelity)
     strips = strips_of(record)
-    assert off_target_ml(strips, setup.prescription) == 0.0
+    assert off_target_ml(strips, real_setup(samples).prescription) == 0.0
     assert volume_ml(record) > 0.85 * asked_ml(strips)
 
 
@@ -131,8 +136,7 @@ def test_the_same_route_without_the_border_rule_sprays_outside(samples: Path) ->
 def test_what_falls_on_rate_0_of_a_real_map_is_what_the_step_allows(
     samples: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    setup = real_setup(samples)
-    found = Overspill.of(fly_route(setup, route_of(dry(setup)), seed=1).record)
+    found = Overspill.of(flown(samples, "dry", 1, "averaged"))
     with capsys.disabled():
         sys.stdout.write(f"\nreal map: {found}\n")
     assert found.zero_ml <= found.bound_ml

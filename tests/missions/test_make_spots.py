@@ -24,7 +24,7 @@ from companion.errors import VrsprayError
 from missions.make.spots import Budget, Part, misses, openings
 from missions.make.spots_cli import read_weeds, spots
 
-pytestmark = pytest.mark.usefixtures("laid_out_once")
+pytestmark = pytest.mark.usefixtures("searched_briefly", "laid_out_once")
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "zones" / "config.toml"

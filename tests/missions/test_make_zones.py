@@ -28,7 +28,7 @@ from missions.make.data import index_of
 from missions.make.passes import Passes, passes_of, places_in
 from missions.make.zones import Limits, Wish, make_zones, settled
 
-pytestmark = pytest.mark.usefixtures("laid_out_once")
+pytestmark = pytest.mark.usefixtures("searched_briefly", "laid_out_once")
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "zones"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -14,6 +13,7 @@ import pytest
 import pytest_asyncio
 from fastapi import APIRouter, HTTPException
 
+from companion.cli.app import execute
 from companion.web.parts import Host, Limits, registered, uploads
 from missions.web import office as module
 from missions.web.office import Office
@@ -198,15 +198,15 @@ async def test_without_a_configuration_no_zones_are_made(tmp_path: Path) -> None
 
 
 @IN_LOOP
-async def test_what_the_command_line_refuses_is_refused_with_its_line(site: Site) -> None:
+async def test_what_the_command_line_refuses_is_refused_with_its_line(
+    site: Site, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert (await load(site, "bad.geojson", b'{"type": "FeatureCollection"')).status == 200
     state = await do(site, "check", file="bad.geojson")
-    said = subprocess.run(  # noqa: ASYNC221
-        [sys.executable, "-m", "companion", "map", "check", "given/bad.geojson", "--json"],
-        cwd=await folder_of(site), capture_output=True, check=False,
-    )  # fmt: skip
-    assert said.returncode == 2
-    assert state["check"]["error"] == json.loads(said.stdout)["error"]
+    with monkeypatch.context() as patch:
+        patch.chdir(await folder_of(site))
+        assert execute(["map", "check", "given/bad.geojson", "--json"]) == 2
+    assert state["check"]["error"] == json.loads(capsys.readouterr().out)["error"]
     assert "given/bad.geojson" in state["check"]["error"]
     state = await do(site, "plan", field="bad.geojson", rate_l_ha=20)
     assert state["plan"]["error"].startswith("given/bad.geojson")

@@ -31,6 +31,7 @@ from companion.cli.app import app
 from companion.config.model import Config
 from companion.link.service import DO_SPRAYER, USER_ESTOP
 from tests.compiling_here import compiled_here
+from tests.laid_out_once import laid_out_once
 from tests.reference.words import words_in
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -146,6 +147,13 @@ def runs(command: str) -> bool:
 # What stands as `text` needs files that a test has not.
 RUNNABLE = {page.name: list(filter(runs, commands(page, ("", "sh")))) for page in PAGES}
 RUNNING = sorted(page for page, found in RUNNABLE.items() if found)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def lines_of_a_field_are_laid_once() -> Iterator[None]:
+    """Most pages plan over the same field: what is asked here is that their commands run."""
+    with laid_out_once():
+        yield
 
 
 @pytest.fixture(scope="module")

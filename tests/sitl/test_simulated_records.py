@@ -127,17 +127,22 @@ def test_only_a_real_flight_makes_a_complete_record(
     assert report_of(path).contents["application"]["eu"]["complete"] is complete
 
 
+@pytest.fixture(scope="module")
+def simulated_flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the journal of a flight as with a product: only what the vehicle is tells."""
+    folder = tmp_path_factory.mktemp("simulated")
+    return fly(folder, simulated=Simulated(word="yes", because="its sensors"))
+
+
 @pytest.mark.parametrize(
     "name", ["a.csv", "a.geojson", "a.geojsonl", "a.kml", "a.shp", "a.parquet", "a.mcap", "a.zip"]
 )
-def test_every_export_of_a_simulated_flight_says_so(tmp_path: Path, name: str) -> None:
-    # Flown as with a product: only what the vehicle is tells.
-    path = fly(tmp_path, simulated=Simulated(word="yes", because="its sensors"))
-    out = tmp_path / "out"
-    out.mkdir()
-    assert execute(["export", str(path), "--out", str(out / name)]) == 0
+def test_every_export_of_a_simulated_flight_says_so(
+    simulated_flight: Path, tmp_path: Path, name: str
+) -> None:
+    assert execute(["export", str(simulated_flight), "--out", str(tmp_path / name)]) == 0
     written = b""
-    for file in out.iterdir():
+    for file in tmp_path.iterdir():
         written += file.read_bytes()
         if zipfile.is_zipfile(file):
             with zipfile.ZipFile(file) as packed:
