@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 import shapely
@@ -113,16 +113,8 @@ class Ways:
         """Return how long the way is from every depot to every place, shape (depots, n)."""
         if self.high is not None:
             return self.high.home_ways_m(ends)
-        known = ends.tobytes()
-        if known not in self._home_ways_m:
-            found: Floats = self._outside_m[:, None] + _inside_m(self.gates, ends, self.inside)
-            self._home_ways_m[known] = found
-        return self._home_ways_m[known].copy()
-
-    @cached_property
-    def _home_ways_m(self) -> dict[bytes, Floats]:
-        """Return what `home_ways_m` has found: the ends of the same lines are asked for again."""
-        return {}
+        found: Floats = self._outside_m[:, None] + _inside_m(self.gates, ends, self.inside)
+        return found
 
     @property
     def are_straight(self) -> bool:
@@ -144,16 +136,35 @@ def _inside_m(depots: Floats, ends: Floats, space: FreeSpace) -> Floats:
     )
     if space.is_convex:
         return far_m
+    known_m = _known_ways_m(space.space)
+    places = [(east_m, north_m) for east_m, north_m in ends.tolist()]
     for number, depot in enumerate(depots):
-        hidden = np.flatnonzero(~space.sees(np.tile(depot, (len(ends), 1)), ends))
-        reach = space.to_corners_m(depot[None, :], nearest=None)
-        if not len(hidden) or not reach.size:
-            continue
-        to_corner_m = np.min(reach[0][:, None] + space.between_m, axis=0)
-        for first in range(0, len(hidden), ENDS_TOGETHER):
-            some = hidden[first : first + ENDS_TOGETHER]
-            bent = _over_corners_m(to_corner_m, ends[some], space)
-            far_m[number, some] = np.where(np.isfinite(bent), bent, far_m[number, some])
+        own_m = known_m.setdefault((float(depot[0]), float(depot[1])), {})
+        new = [at for at, place in enumerate(places) if place not in own_m]
+        if new:
+            new_m = _bent_m(depot, ends[new], far_m[number, new], space).tolist()
+            own_m.update(zip((places[at] for at in new), new_m, strict=True))
+        far_m[number] = [own_m[place] for place in places]
+    return far_m
+
+
+@lru_cache(maxsize=4)
+def _known_ways_m(_space: BaseGeometry) -> dict[Place, dict[Place, float]]:
+    """Return the ways that `_inside_m` has found: ends of the same lines are asked for again."""
+    return {}
+
+
+def _bent_m(depot: Floats, ends: Floats, far_m: Floats, space: FreeSpace) -> Floats:
+    """Return the way from a depot to each end: straight where it sees it, as far as it may."""
+    hidden = np.flatnonzero(~space.sees(np.tile(depot, (len(ends), 1)), ends))
+    reach = space.to_corners_m(depot[None, :], nearest=None)
+    if not len(hidden) or not reach.size:
+        return far_m
+    to_corner_m = np.min(reach[0][:, None] + space.between_m, axis=0)
+    for first in range(0, len(hidden), ENDS_TOGETHER):
+        some = hidden[first : first + ENDS_TOGETHER]
+        bent = _over_corners_m(to_corner_m, ends[some], space)
+        far_m[some] = np.where(np.isfinite(bent), bent, far_m[some])
     return far_m
 
 
