@@ -59,16 +59,10 @@ def waypoints_of(sortie: Sortie, *, apart: bool = False) -> list[Stop]:
             if not goes_on:
                 _add(stops, leg.points[0], legs[number - 1].speed_m_s, apart=apart)
             stops.append(
-                Stop(
-                    place=leg.points[-1], speed_m_s=leg.speed_m_s,
-                    opens=False if ends else None, on_line=True,
-                )
-            )  # fmt: skip
+                Stop(leg.points[-1], leg.speed_m_s, opens=False if ends else None, on_line=True)
+            )
             continue
-        stops += [
-            Stop(place=place, speed_m_s=leg.speed_m_s, height_m=leg.height_m)
-            for place in leg.points[1:-1]
-        ]
+        stops += [Stop(place, leg.speed_m_s, height_m=leg.height_m) for place in leg.points[1:-1]]
     return stops if apart else _without_runs(stops)
 
 
@@ -114,21 +108,23 @@ def _changed(before: Leg, leg: Leg) -> list[Stop]:
 
 
 def _without_runs(stops: list[Stop]) -> list[Stop]:
-    kept, row = stops[:1], _Row()
-    for here, after in zip(stops[1:], [*stops[2:], None], strict=True):
-        goes_on = (
-            after is not None
-            and after.speed_m_s == here.speed_m_s
-            and kept[-1].height_m == here.height_m == after.height_m
-        )
-        if after is not None and goes_on:
-            ends = (kept[-1].place, here.place, after.place)
-            if row.leaves_out(ends, opens=here.opens, on_line=here.on_line):
-                continue
+    kept, row, last = stops[:1], _Row(), stops[0]
+    for here, after in pairwise(stops[1:]):
+        if (
+            after.speed_m_s == here.speed_m_s
+            and last.height_m == here.height_m == after.height_m
+            # Most places are corners: what is no run and not passed is known at once.
+            and _is_beside(last.place, here.place, after.place, SAME_M / 2.0)
+            and row.leaves_out(
+                (last.place, here.place, after.place), opens=here.opens, on_line=here.on_line
+            )
+        ):
+            continue
         kept.append(here)
+        last = here
         if row.passed:
             row = _Row()
-    return kept
+    return [*kept, *stops[1:][-1:]]
 
 
 @dataclass(slots=True)
@@ -147,12 +143,10 @@ class _Row:
     ) -> bool:
         """Leave the middle place out where the way between the others needs no waypoint there.
 
-        A line whose leg begins or ends too far beyond it stays dry: of a gap one place stays.
+        It lies beside that way (`_is_beside`). A line whose leg begins or ends too far beyond it
+        stays dry: of a gap one place stays.
         """
         before, here, after = ends
-        # Most places are corners: what is no run and not passed is known at once.
-        if not _is_beside(before, here, after, SAME_M / 2.0):
-            return False
         ended = here if self.ended is None and opens is False else self.ended
         is_far = opens is True and math.dist(before, here) > RUN_M
         is_far |= ended is not None and math.dist(ended, after) > RUN_M
@@ -362,6 +356,7 @@ def _ways_without_runs(ways: list[_Stretch], sprays: Sequence[bool]) -> list[_St
         if (
             level
             and way.speed_m_s == last.speed_m_s
+            and _is_beside(last.start, last.end, way.end, SAME_M / 2.0)
             and row.leaves_out(
                 (last.start, last.end, way.end),
                 opens=None if before == after else after,
