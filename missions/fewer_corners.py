@@ -38,10 +38,11 @@ STARTS = (0, 2)
 # Of two borders with as many edges the one that gives less ground away; a corner more is worth
 # as much as the ground along four edges in the middle of the tolerance.
 DEPTH_COST = 0.125
-# From so many corners at once as many points ahead are looked at, and then twice as many.
-TOGETHER, AHEAD = 64, 8
+# From so many corners at once as many points ahead are looked at, and then twice as many, to so
+# many at once.
+TOGETHER, AHEAD, AHEAD_MOST = 256, 8, 64
 # Rings of nearly as many corners are drawn together, so many corners of them.
-ROWS, ALIKE = 512, 0.5
+ROWS, ALIKE = 1024, 0.5
 # Rounding of angles [rad]: 1e-9 is a micrometre over a kilometre. The caller keeps a margin.
 ROUNDING = 1e-9
 TURN = 2.0 * math.pi
@@ -335,7 +336,7 @@ def _ahead(rings: _Rings, starts: Ints) -> Bytes:
             sets_of |= fits.view(np.uint8) * bit
         sets[some[row], near] = sets_of
         found.append(sets)
-        ahead, many = ahead + many, 2 * many
+        ahead, many = ahead + many, min(2 * many, AHEAD_MOST)
         low, high = least[:, :, -1], most[:, :, -1]
         on = (low <= high).any(axis=0) & (at + ahead <= counts[ring])
         some, ring, at, onward = some[on], ring[on], at[on], onward[on]
