@@ -408,9 +408,10 @@ def _option(
     # The end of a line that is straight on is no waypoint, nor is home.
     first = int(bool(beyond_m[0]) and not ends[0].keeps)
     last = len(points) - int(bool(beyond_m[1]) and not ends[1].keeps)
-    flown = points[first + ends[0].is_home : last - ends[1].is_home]
-    near = sum(math.dist(a, b) < NEAR_M for a, b in pairwise(flown))
-    length_m = sum(math.dist(a, b) for a, b in pairwise(points))
+    parts_m = list(map(math.dist, points, points[1:]))
+    flown_m = parts_m[first + ends[0].is_home : max(last - ends[1].is_home - 1, 0)]
+    near = sum(part_m < NEAR_M for part_m in flown_m)
+    length_m = sum(parts_m)
     return _Option(
         points=points, first=points[first], last=points[last - 1],
         cost_m=length_m + WAYPOINT_M * (last - first), near=near,
@@ -453,11 +454,7 @@ class _Nodes:
 
 
 def _around(
-    ends: tuple[_End, _End],
-    corners: Sequence[Place],
-    free: _Free,
-    *,
-    anywhere: bool = False,
+    ends: tuple[_End, _End], corners: Sequence[Place], free: _Free, *, anywhere: bool = False
 ) -> list[_Option]:
     """Return ways over corners as they are or moved, one for each pair of begin and end.
 
@@ -465,23 +462,25 @@ def _around(
     """
     nodes = _nodes(ends, corners, free.inside, anywhere=anywhere)
     steps_m = _steps_m(nodes, (ends[0].is_home, ends[1].is_home), free.corners)
-    last = int(nodes.ranks[-1])
-    starts, goals = np.flatnonzero(nodes.ranks == 0), np.flatnonzero(nodes.ranks == last)
+    count = int((nodes.ranks == 0).sum())
+    goals = np.flatnonzero(nodes.ranks == nodes.ranks[-1]).tolist()
+    # From each of the places where it begins, which come first.
+    starts = np.arange(count)
+    cost_m = np.full((count, len(nodes.ranks)), math.inf)
+    cost_m[starts, starts] = 0.0
+    before = np.zeros(cost_m.shape, dtype=np.int64)
+    for node in range(count, len(nodes.ranks)):
+        over = cost_m + steps_m[:, node]
+        before[:, node] = over.argmin(axis=1)
+        cost_m[:, node] = over.min(axis=1)
     found = []
-    for start in starts.tolist():
-        cost_m = np.full(len(nodes.ranks), math.inf)
-        cost_m[start] = 0.0
-        before = np.zeros(len(nodes.ranks), dtype=np.int64)
-        for node in range(len(starts), len(nodes.ranks)):
-            over = cost_m + steps_m[:, node]
-            before[node] = int(np.argmin(over))
-            cost_m[node] = over[before[node]]
-        for goal in goals.tolist():
-            if not math.isfinite(cost_m[goal]):
+    for start, (costs_m, chosen) in enumerate(zip(cost_m.tolist(), before.tolist(), strict=True)):
+        for goal in goals:
+            if not math.isfinite(costs_m[goal]):
                 continue
             chain = [goal]
             while chain[-1] != start:
-                chain.append(int(before[chain[-1]]))
+                chain.append(chosen[chain[-1]])
             places = [_place(nodes.places[each]) for each in chain[-2:0:-1]]
             found.append(_option(ends, (nodes.beyond_m[start], nodes.beyond_m[goal]), places))
     return found
