@@ -25,7 +25,7 @@ from missions.upload.transfer import sorties_from
 from sitl.stub.mission_items import read_mission
 from tests.bench.missions import to_degrees
 
-pytestmark = pytest.mark.usefixtures("searched_briefly")
+pytestmark = pytest.mark.usefixtures("searched_briefly", "laid_out_once")
 
 ANYANG = Path(__file__).parents[2] / "examples" / "anyang"
 

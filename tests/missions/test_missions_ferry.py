@@ -19,7 +19,7 @@ from tests.missions.test_missions_cli import written
 from tests.missions.test_missions_obstacles import degrees, ways_m
 from tests.missions.test_missions_terrain import tile
 
-pytestmark = pytest.mark.usefixtures("searched_briefly")
+pytestmark = pytest.mark.usefixtures("searched_briefly", "laid_out_once")
 
 FIELD = box(0, 0, 60, 200)
 # 60 m south of the field's middle.

@@ -24,6 +24,8 @@ from missions.plan import Plan, Settings
 from missions.planner import plan_mission
 from tests.bench.missions import FRAME, to_degrees
 
+pytestmark = pytest.mark.usefixtures("searched_briefly", "laid_out_once")
+
 SCHEMA = json.loads((Path(missions.files.__file__).parent / "plan.schema.json").read_text())
 TYPES: dict[str, Callable[[Any], bool]] = {
     "object": lambda v: isinstance(v, dict),

@@ -17,6 +17,8 @@ from missions.strips import lengths_m
 from tests.bench.missions import FRAME
 from tests.missions.test_missions_cli import run, written
 
+pytestmark = pytest.mark.usefixtures("searched_briefly", "laid_out_once")
+
 FIELD = box(0.0, 0.0, 120.0, 200.0)
 
 
