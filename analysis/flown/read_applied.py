@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache, partial
+from operator import methodcaller
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -79,19 +80,32 @@ def is_change(row: Row, valves: int) -> bool:
     )
 
 
-def are_changes(columns: Sequence[tuple[Any, ...]], valves: int) -> bool:
-    """Whether rows, here in columns, surely all are changes: quicker than each by itself."""
-    _, planned, actual, valve, duty = columns
-    if {*map(type, valve), *map(type, duty)} != {int}:
-        return False
-    if not (min(valve) >= 0 and max(valve) < valves and min(duty) >= 0):
-        return False
-    times = set(map(type, planned)), set(map(type, actual))
-    return (
-        max(duty) <= PERMILLE_MAX
-        and times[0] | times[1] <= {int, type(None)}
-        and not (type(None) in times[0] and type(None) in times[1])
-    )
+def numbers_of_changes(columns: Sequence[tuple[Any, ...]], valves: int) -> Floats | None:
+    """Return rows, here in columns, as numbers where surely all are changes; NaN is a missing one.
+
+    Quicker than to look at each by itself.
+    """
+    planned, actual, *others = ({*map(type, column)} for column in columns[1:])
+    if not (others == [{int}, {int}] and planned | actual <= {int, type(None)}):
+        return None
+    if type(None) in planned and type(None) in actual:
+        return None
+    table = numbers_in(columns)
+    valve, duty = table[3:]
+    is_sound = valve.min() >= 0.0 and valve.max() < valves
+    is_sound = is_sound and duty.min() >= 0.0 and duty.max() <= PERMILLE_MAX
+    return table if is_sound else None
+
+
+def numbers_in(columns: Sequence[tuple[Any, ...]]) -> Floats:
+    """Return columns of numbers, a row each; NaN is what is missing. Of rows numpy takes longer."""
+    table = np.full((len(columns), len(columns[0])), math.nan)
+    for row, column in zip(table, columns, strict=True):
+        if None not in column:
+            row[:] = np.fromiter(column, dtype=np.float64, count=len(column))
+        elif column.count(None) < len(column):
+            row[:] = np.array(column, dtype=np.float64)
+    return table
 
 
 def is_sample(row: Row) -> bool:
@@ -199,7 +213,7 @@ def flight_of(
     """
     if unread is not None:
         # A byte that is no text makes one word wrong and not a whole table.
-        journal.connection.text_factory = lambda raw: raw.decode("utf-8", errors="replace")
+        journal.connection.text_factory = methodcaller("decode", "utf-8", "replace")
     meta = journal.meta
     names = _names_of(meta["setup"])
     applied = read_samples(journal, len(setup.boom.valves), unread)
@@ -339,18 +353,17 @@ def read_changes(
     what = "valve changes"
     if journal.version == "1":
         made = enumerate_rows(_planned(journal, names, unread))
-        return _in_order(_table(list(zip(*made, strict=True)))), []
+        return _in_order(_table(list(made))), []
     found = rows_of(
         journal.connection, "valve_changes", _COLUMNS, key="id", unread=unread, what=what
     )
     columns = list(zip(*found.rows, strict=True))
-    if columns and not are_changes(columns, valves):
-        rows = sound_rows(found.rows, partial(is_change, valves=valves), unread, what)
-        columns = list(zip(*rows, strict=True))
-    table = _table(columns)
+    table = numbers_of_changes(columns, valves) if columns else None
+    if table is None:
+        table = _table(sound_rows(found.rows, partial(is_change, valves=valves), unread, what))
     changes = _changes(table)
     holes = change_holes(
-        table[:, 0].astype(np.int64),
+        table[0].astype(np.int64),
         np.where(np.isnan(changes.actual_s), changes.planned_s, changes.actual_s),
         int(journal.meta.get("rows_valve_changes") or 0),
         reaches_end=found.reaches_end,
@@ -363,26 +376,26 @@ def enumerate_rows(rows: Iterator[tuple[int | None, int | None, int, int]]) -> I
     return ((number, *row) for number, row in enumerate(rows, start=1))
 
 
-def _table(columns: Sequence[tuple[Any, ...]]) -> Floats:
-    # Of rows numpy takes twice as long.
-    found = [np.array(column, dtype=np.float64) for column in columns]
-    return np.stack(found, axis=1) if found else np.empty((0, 5))
+def _table(rows: Sequence[Row]) -> Floats:
+    return numbers_in(list(zip(*rows, strict=True))) if rows else np.empty((5, 0))
 
 
 def _changes(table: Floats) -> ValveChanges:
-    planned_s, actual_s = table[:, 1] * _MICRO, table[:, 2] * _MICRO
+    planned_s, actual_s = table[1] * _MICRO, table[2] * _MICRO
     return ValveChanges(
         # What no plan asked for (a fault that closed) has its real time only.
         planned_s=np.where(np.isnan(planned_s), actual_s, planned_s),
         actual_s=actual_s,
-        valve=table[:, 3].astype(np.int64),
-        duty=table[:, 4] / 1000.0,
+        valve=table[3].astype(np.int64),
+        duty=table[4] / 1000.0,
     )
 
 
 def _in_order(table: Floats) -> ValveChanges:
-    at_us = np.where(np.isnan(table[:, 2]), table[:, 1], table[:, 2])
-    return _changes(table[np.argsort(at_us, kind="stable")])
+    at_us = np.where(np.isnan(table[2]), table[1], table[2])
+    order = np.argsort(at_us, kind="stable")
+    # Most are in order as they were planned.
+    return _changes(table[:, order] if (np.diff(order) < 0).any() else table)
 
 
 def _planned(
@@ -442,11 +455,8 @@ def read_samples(journal: OpenJournal, valves: int, unread: list[str] | None) ->
     )
     count = int(journal.meta.get("rows_applied") or 0)
     placed = [row for row in rows if row[1] is not None]
-    place = np.frombuffer(b"".join(row[1] for row in placed), dtype=_POINT)
-    # Column by column: of rows numpy takes twice as long.
-    columns = np.array(
-        [np.array(column, dtype=np.float64) for column in list(zip(*placed, strict=True))[2:9]]
-    ).reshape(7, -1)
+    place = np.frombuffer(b"".join([row[1] for row in placed]), dtype=_POINT)
+    columns = numbers_in(list(zip(*placed, strict=True))[2:9]) if placed else np.empty((7, 0))
     sound = np.isfinite(place["lat"]) & np.isfinite(place["lon"])
     order = np.flatnonzero(sound)[np.argsort(columns[0, sound], kind="stable")]
     return Samples(

@@ -225,8 +225,11 @@ class _PackedFloats(NamedTuple):
         """Return their integers; those of more than 64 bits are `_UnusualError`."""
         if self.width > 8:
             raise _UnusualError
+        raw = np.frombuffer(self.raw, dtype=np.uint8)
+        if self.width == 1:
+            return _summed(raw.astype(np.uint64))
         planes = np.zeros((self.how_many, 8), dtype=np.uint8)
-        planes[:, : self.width] = np.frombuffer(self.raw, dtype=np.uint8).reshape(self.width, -1).T
+        planes[:, : self.width] = raw.reshape(self.width, -1).T
         return _summed(planes.view("<u8").ravel())
 
 
@@ -248,14 +251,19 @@ class _Reader(Reader):
         if len(ends) < count:
             raise _UnusualError
         starts = np.concatenate(([0], ends[:-1] + 1))
-        lengths = ends - starts + 1
-        if lengths.max() > _BYTES_OF_INT64:
+        found = raw[ends].astype(np.int64)
+        # Most have one byte; of the others the first ones are put below the last.
+        long = np.flatnonzero(ends != starts)
+        starts, more = starts[long], (ends - starts)[long]
+        if more.max(initial=0) >= _BYTES_OF_INT64:
             raise _UnusualError
-        used = int(ends[-1]) + 1
-        place = np.arange(used) - np.repeat(starts, lengths)
-        parts = (raw[:used] & PLENTY).astype(np.int64) << (7 * place)
-        self._at += used
-        return np.add.reduceat(parts, starts)
+        found[long] <<= 7 * more
+        for place in range(int(more.max(initial=0))):
+            its = np.flatnonzero(more > place)
+            low = (raw[starts[its] + place] & PLENTY).astype(np.int64)
+            found[long[its]] |= low << (7 * place)
+        self._at += int(ends[-1]) + 1
+        return found
 
     def packed_floats(self, count: int) -> _PackedFloats:
         """Return new numbers as they are kept: nobody may want them."""
@@ -309,27 +317,26 @@ class _Numbers:
         self._first = ends - held
         self._line = np.repeat(np.arange(count), held)
         total = int(ends[-1]) if count else 0
-        self._column_of = np.full(total, -1, dtype=np.int64)
         self._ints: dict[Key, Ints] = {}
         self._floats: list[_Floats] = []
         self._number_of: dict[Key, int] = {}
-        is_new = np.zeros(total, dtype=np.bool_)
-        for key, slots in self._slots(is_float).items():
-            codes = reader.words(len(slots))
-            if key[0] != FLOAT:
-                self._ints[key] = _summed(codes.view(np.uint64))
-                continue
-            self._number_of[key] = len(self._floats)
-            self._column_of[slots] = len(self._floats)
-            is_new[slots] = codes == NEW
-            self._floats.append(_Floats(slots, codes))
+        # The codes of all columns follow each other: read at once.
+        slots_of = self._slots(is_float)
+        codes = reader.words(sum(map(len, slots_of.values())))
+        first = 0
+        for key, slots in slots_of.items():
+            its = codes[first : first + len(slots)]
+            first += len(slots)
+            if key[0] == FLOAT:
+                self._number_of[key] = len(self._floats)
+                self._floats.append(_Floats(slots, its))
+            else:
+                self._ints[key] = _summed(its.view(np.uint64))
+        self._column_of, is_new, news = _told_by(self._floats, total)
         self._rank = np.cumsum(is_new)
         self._new_slots = np.flatnonzero(is_new)
         self._new_column = self._column_of[self._new_slots]
-        self._fresh = [
-            reader.packed_floats(news) if (news := _count_of(each.codes, NEW)) else None
-            for each in self._floats
-        ]
+        self._fresh = [reader.packed_floats(each) if each else None for each in news]
         self._seen = np.full(len(self._new_slots), np.nan)
         self._known: set[int] = set()
         self._asked: set[int] = set()
@@ -399,8 +406,10 @@ class _Numbers:
             return each[np.searchsorted(its, lines)].astype(np.float64)
         place = sum(other[0] == FLOAT for other in keys[:hole])
         number = self._number_of[key]
-        slots = self._floats[number].slots
-        return self._values(number)[np.searchsorted(slots, self._first[lines] + place)]
+        slots, values = self._floats[number].slots, self._values(number)
+        if len(slots) == len(lines):  # no other form has such a number
+            return values
+        return values[np.searchsorted(slots, self._first[lines] + place)]
 
     def _lines_with(self, key: Key) -> Ints:
         return np.sort(
@@ -473,8 +482,19 @@ class _Numbers:
         return found
 
 
-def _count_of(codes: Ints, code: int) -> int:
-    return int(np.count_nonzero(codes == code))
+def _told_by(columns: Sequence[_Floats], total: int) -> tuple[Ints, NDArray[np.bool_], list[int]]:
+    """Return of each float of a block the column, and whether it is new; and each column's count.
+
+    The count is that of new ones.
+    """
+    column_of, is_new = np.full(total, -1, dtype=np.int64), np.zeros(total, dtype=np.bool_)
+    if not columns:
+        return column_of, is_new, []
+    slots = np.concatenate([each.slots for each in columns])
+    number = np.repeat(np.arange(len(columns)), [len(each.slots) for each in columns])
+    new = np.concatenate([each.codes for each in columns]) == NEW
+    column_of[slots], is_new[slots] = number, new
+    return column_of, is_new, np.bincount(number[new], minlength=len(columns)).tolist()
 
 
 def _in_order(parts: Sequence[tuple[Ints, Floats]], width: int) -> Floats:
