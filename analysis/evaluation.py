@@ -289,8 +289,11 @@ def _steps(strip: Strip, record: FlightRecord) -> list[Step]:
     holds = with_unknown(holds, unknown)
     steps = measure_steps(strip.track, strip.stretches, strip.orders, record.duty_limits, holds)
     spared = _spared_spans(strip)
+    steps = held_by_border(strip, record.prescription, steps)
+    if not (unknown or spared):
+        return steps
     found = []
-    for step in held_by_border(strip, record.prescription, steps):
+    for step in steps:
         verdict = step.verdict
         if _is_within(step.change.time_s, unknown):
             verdict = Verdict.UNKNOWN

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from analysis.flight_record import joined
-from analysis.strips import closed_by_order
+from analysis.strips import given_by
 from analysis.transitions import LEVEL_FROM, LEVEL_TO, ML_M_PER_L_HA_M, Sides
 
 if TYPE_CHECKING:
@@ -75,8 +75,7 @@ def holds_of(
         return ()
     at_s, duty = orders.at_s, orders.duty
     marks_s = track.time_s[track.marks]
-    given = np.searchsorted(at_s, marks_s, "right")
-    is_closed = closed_by_order(orders, marks_s)
+    given, is_closed = given_by(orders, marks_s)
     starts_s = np.array([run.start_s for run in stretches])
     under = np.clip(np.searchsorted(starts_s, marks_s, "right") - 1, 0, None)
     inside = np.array([run.inside for run in stretches])[under]

@@ -35,9 +35,20 @@ _OFFSET = 2**31
 
 def closed_by_order(orders: Orders, at_s: Floats) -> Bools:
     """Return at which times a valve is closed by its orders; before the first it is."""
+    return _are_closed(orders, np.searchsorted(orders.at_s, at_s, "right"))
+
+
+def given_by(orders: Orders, marks_s: Floats) -> tuple[Ints, Bools]:
+    """Return how many orders were given by each of times in order, and where they close a valve."""
+    # Fewer orders are sought among the marks than marks among the orders.
+    first = np.searchsorted(marks_s, orders.at_s)
+    given: Ints = np.bincount(first, minlength=len(marks_s) + 1)[:-1].cumsum()
+    return given, _are_closed(orders, given)
+
+
+def _are_closed(orders: Orders, given: Ints) -> Bools:
     duty = np.concatenate(([0.0], orders.duty))
-    given = np.searchsorted(orders.at_s, at_s, "right")
-    closed: Bools = ~(duty[given] > 0.0)
+    closed: Bools = ~(duty > 0.0)[given]
     return closed
 
 
