@@ -241,13 +241,13 @@ def read_only(path: Path, *, timeout_s: float = 1.0) -> Iterator[sqlite3.Connect
     check_beside(path)
     log, index = log_of(path), path.with_name(path.name + "-shm")
     with ExitStack() as at_end:
-        folder = at_end.enter_context(tempfile.TemporaryDirectory(prefix="vrspray-"))
         source = path
         if log.exists() and not index.exists():
             # SQLite makes one to read the log by, and leaves it; nobody needs it any more.
             at_end.callback(index.unlink, missing_ok=True)
         if log.exists() and not os.access(path.parent, os.W_OK):
             # SQLite needs a shared-memory file beside a log: read a copy.
+            folder = at_end.enter_context(tempfile.TemporaryDirectory(prefix="vrspray-"))
             for file in (path, log):
                 shutil.copy(file, folder)
             source = Path(folder) / path.name
