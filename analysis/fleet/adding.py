@@ -21,7 +21,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Self, TypeVar
 
-from analysis.fleet.flight_row import Problem, Row, Signature, evaluated, flown_by, recorded
+from analysis.fleet.row import Problem, Row, Signature, flown_by
 from companion.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -192,12 +192,19 @@ def _evaluate(
     )
 
 
+# What reads journals is loaded where that is done: in the processes, if there are any.
+
+
 def _recorded(path: Path, *, machine: str | None, known: Container[str]) -> tuple[_Read, Signature]:
+    from analysis.fleet.flight_row import recorded
+
     signature = Signature.of(path)
     return recorded(path, machine=machine, known=known), signature
 
 
 def _evaluated(task: _Waiting) -> _Read:
+    from analysis.fleet.flight_row import evaluated
+
     # A flight that went on since then is read anew.
     row = task.row if task.signature == Signature.of(task.path) else None
     return evaluated(task.path, machine=task.machine, row=row)
@@ -284,6 +291,8 @@ def _started(processes: int) -> ProcessPoolExecutor:
 
 def _end_with_parent() -> None:
     """Leave Ctrl-C to the parent, and end when it does, also by a kill."""
+    import analysis.fleet.flight_row  # noqa: F401
+
     # What is imported by now stays: the garbage of each flight is looked for among its own.
     gc.freeze()
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -181,7 +181,7 @@ def forget(
 
     They stay removed when their journals are added again.
     """
-    from analysis.fleet.flight_row import operator_number
+    from analysis.fleet.row import operator_number
     from analysis.fleet.store import STORE_ERRORS, Store
     from companion.errors import ConfigError
 

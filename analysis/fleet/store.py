@@ -22,7 +22,7 @@ import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 from fsspec.core import url_to_fs
 
-from analysis.fleet.flight_row import COLUMNS, ROW_VERSION, Problem, Row, newest
+from analysis.fleet.row import COLUMNS, ROW_VERSION, Problem, Row, newest
 from companion.atomic_write import write_atomically
 from companion.errors import ConfigError
 

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from analysis.fleet.flight_row import KINDS
+from analysis.fleet.row import KINDS
 from companion.errors import ConfigError
 
 if TYPE_CHECKING:

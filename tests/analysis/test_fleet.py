@@ -15,7 +15,8 @@ import pytest
 
 from analysis.fleet.adding import add, journals_in
 from analysis.fleet.asking import asked
-from analysis.fleet.flight_row import COLUMNS, operator_number, recorded
+from analysis.fleet.flight_row import recorded
+from analysis.fleet.row import COLUMNS, operator_number
 from analysis.fleet.store import Store
 from companion.cli import answer
 from companion.cli.app import execute

@@ -14,8 +14,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from analysis.fleet.asking import asked
-from analysis.fleet.flight_row import Row, recorded
+from analysis.fleet.flight_row import recorded
 from analysis.fleet.page import body_of, charts_of
+from analysis.fleet.row import Row
 from analysis.fleet.serving import build_app
 from analysis.fleet.store import Store
 from analysis.fleet.summary import FIGURES, GROUPS, summary_of

@@ -21,7 +21,8 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from analysis.fleet.flight_row import Row, recorded
+from analysis.fleet.flight_row import recorded
+from analysis.fleet.row import Row
 from analysis.fleet.store import Store
 from tests.analysis.fleet_flights import copied, started
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from analysis.fleet.flight_row import COLUMNS
+from analysis.fleet.row import COLUMNS
 from analysis.fleet.summary import FIGURES
 
 INTRODUCTION = """# Fleet tables
