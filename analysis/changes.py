@@ -328,7 +328,8 @@ class _States:
         asked = np.ones(len(marked.time_s), dtype=np.bool_)
         if self.tracks[0].planned is None:
             clear = np.flatnonzero(self.lookup.constant(marked.east_m, marked.north_m)) * PIECE
-            asked[(clear[:, np.newaxis] + np.arange(1, PIECE)).ravel()] = False
+            # The last point of a piece is the first of the next one.
+            asked[(clear[:, np.newaxis] + np.arange(1, PIECE + 1)).ravel()] = False
         return asked
 
     def runs(self, track: Track, states: Sequence[int], ends_s: Floats) -> list[Run]:

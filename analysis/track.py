@@ -43,13 +43,17 @@ def shifted(values: Floats, steps: float) -> Floats:
     kept = values[max(whole, 0) : max(whole, 0) + len(moved) - before]
     moved[before : before + len(kept)] = kept
     moved[before + len(kept) :] = values[last]
-    mixed: Floats = moved[:-1] * (1.0 - part) + moved[1:] * part
+    mixed: Floats = moved[:-1] * (1.0 - part)
+    moved *= part
+    mixed += moved[1:]
     return mixed
 
 
 def rise_over(values: Floats, steps: float) -> Floats:
     """Return by how much `values` rise over `steps` centred at each sample."""
-    return shifted(values, steps / 2) - shifted(values, -steps / 2)
+    found = shifted(values, steps / 2)
+    found -= shifted(values, -steps / 2)
+    return found
 
 
 def boxed(values: Floats, steps: float) -> Floats:
@@ -57,8 +61,12 @@ def boxed(values: Floats, steps: float) -> Floats:
     half = math.ceil(steps / 2) + 1
     padded = np.concatenate((np.full(half, values[0]), values, np.full(half, values[-1])))
     padded -= values[0]
-    integral = np.concatenate(([0.0], np.cumsum(0.5 * (padded[1:] + padded[:-1]))))
-    smooth: Floats = rise_over(integral, steps)[half:-half] / steps + values[0]
+    pairs = padded[1:] + padded[:-1]
+    pairs *= 0.5
+    integral = np.zeros(len(padded))
+    np.cumsum(pairs, out=integral[1:])
+    smooth: Floats = rise_over(integral, steps)[half:-half] / steps
+    smooth += values[0]
     return smooth
 
 

@@ -162,7 +162,7 @@ def _sorted(
         (Cause.EDGE, in_edge(marks, steps) | beside_border(marks, closed)),
         (Cause.CHANGE, in_change(marks, steps)),
         (Cause.SATURATION, in_saturation(marks)),
-        (Cause.ACCELERATION, in_acceleration(marks)),
+        (Cause.ACCELERATION, in_acceleration(marks, off)),
         (Cause.SKIP, closed),
     )
     left, found = off.copy(), []
@@ -267,13 +267,14 @@ def in_saturation(marks: Marks) -> Bools:
     return saturated
 
 
-def in_acceleration(marks: Marks) -> Bools:
-    """Return where the speed was changing."""
+def in_acceleration(marks: Marks, off: Bools) -> Bools:
+    """Return where, of the marks that are `off`, the speed was changing."""
     track = marks.strip.track
-    half_s = 0.5 * ACCELERATION_OVER_S
-    after: Floats = track.at(track.speed_m_s, marks.time_s + half_s)
-    before: Floats = track.at(track.speed_m_s, marks.time_s - half_s)
-    found: Bools = np.abs(after - before) > ACCELERATION_M_S2 * ACCELERATION_OVER_S
+    half_s, time_s = 0.5 * ACCELERATION_OVER_S, marks.time_s[off]
+    after: Floats = track.at(track.speed_m_s, time_s + half_s)
+    before: Floats = track.at(track.speed_m_s, time_s - half_s)
+    found = np.zeros(len(off), dtype=np.bool_)
+    found[off] = np.abs(after - before) > ACCELERATION_M_S2 * ACCELERATION_OVER_S
     return found
 
 
