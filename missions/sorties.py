@@ -43,6 +43,8 @@ TANKS_MAX = 1500
 # With more pieces the annealing finds little in its time that regrouping does not find sooner.
 ANNEALED_MAX = 400
 TOUCH_M = 1e-3
+# The cosine of what is flown from one line into the next without a turn.
+STRAIGHT_ON = math.cos(math.radians(JOIN_DEG))
 # One sortie is flown the way round on which the ferry out is the shorter one: the longer one leads
 # along the lines, and before the first of them the aircraft would turn back with its nose a second
 # or more behind; and it carries the whole tank. So much longer it may be.
@@ -434,7 +436,7 @@ class _Drawn:
                 litres=float(self._pieces.litres[enter >> 1]),
                 line=int(self._pieces.line[enter >> 1]),
             )
-            if runs and run.line == runs[-1].line and _far_m(runs[-1].end, run.start) < TOUCH_M:
+            if runs and run.line == runs[-1].line and math.dist(runs[-1].end, run.start) < TOUCH_M:
                 run = replace(run, start=runs[-1].start, litres=runs[-1].litres + run.litres)
                 runs.pop()
             runs.append(run)
@@ -442,7 +444,7 @@ class _Drawn:
 
     def _join(self, before: _Run, after: _Run) -> Leg:
         """Return the way from one line to the next: through, where neither has to stop."""
-        is_on = before.line == after.line or _far_m(before.end, after.start) < JOIN_M
+        is_on = before.line == after.line or math.dist(before.end, after.start) < JOIN_M
         if is_on and _is_straight(before, after):
             return self._leg("transit", [before.end, after.start], through=True)
         way, leaves = self._ways.between(before.end, after.start)
@@ -473,29 +475,26 @@ def _place(point: list[float]) -> Place:
     return point[0], point[1]
 
 
-def _far_m(a: Place, b: Place) -> float:
-    return float(np.hypot(b[0] - a[0], b[1] - a[1]))
-
-
 def _is_across(first: _Run, second: _Run) -> bool:
     """Return whether one line goes on in the other, behind ground that is not sprayed."""
+    if not _is_straight(first, second) or math.dist(first.end, second.start) > ACROSS_M:
+        return False
     gap = shapely.LineString([first.start, second.end])
     ends = shapely.points([first.end, second.start])
-    apart_m = _far_m(first.end, second.start)
-    return (
-        _is_straight(first, second)
-        and apart_m <= ACROSS_M
-        and float(shapely.distance(gap, ends).max()) <= STRAIGHT_M
-    )
+    return float(shapely.distance(gap, ends).max()) <= STRAIGHT_M
 
 
 def _is_straight(first: _Run, second: _Run) -> bool:
     """Return whether the aircraft flies from one line into the next without a turn."""
-    way = np.subtract(second.start, first.end)
-    one, two = np.subtract(first.end, first.start), np.subtract(second.end, second.start)
-    cosine = float(one @ two) / float(np.hypot(*one) * np.hypot(*two))
-    ahead = float(way @ one) >= 0.0 or float(np.hypot(*way)) < JOIN_M
-    return ahead and bool(cosine > np.cos(np.radians(JOIN_DEG)))
+    way = _way(first.end, second.start)
+    one, two = _way(first.start, first.end), _way(second.start, second.end)
+    cosine = (one[0] * two[0] + one[1] * two[1]) / (math.hypot(*one) * math.hypot(*two))
+    ahead = way[0] * one[0] + way[1] * one[1] >= 0.0 or math.hypot(*way) < JOIN_M
+    return ahead and cosine > STRAIGHT_ON
+
+
+def _way(start: Place, end: Place) -> Place:
+    return end[0] - start[0], end[1] - start[1]
 
 
 # Whether a battery lasts for a sortie while its pieces are still being moved about.
