@@ -187,6 +187,10 @@ def prepare(options: FlyOptions) -> Task:
             f"--meter-rate-hz {options.meter_rate_hz:g}: give 0 (no meter) to {METER_RATE_MAX_HZ:g}"
         )
     config = load(options.config, overrides=options.overrides)
+    if options.output is None and config.output.kind == "none":
+        raise ConfigError(
+            f"{options.config}: output.kind = 'none' moves no valve; give --output gpio or servo"
+        )
     refuse_mismatch(config)
     setup = compiled_setup(config)
     if options.fidelity != "pulsed" or options.output == "servo":

@@ -340,7 +340,7 @@ def map_checks(
     area_ha = setup.prescription.field.area / 1e4
     span = f"{min(rates):g} to {max(rates):g} L/ha" if rates else "no rates"
     found = [
-        ok("map", f"{area_ha:.2f} ha, {span}"),
+        ok("map", f"{area_ha:.2f} ha, {span}, hash {setup.prescription.sha256[:8]}"),
         _flight_map(flight_map, now),
         _rates(config, setup),
     ]

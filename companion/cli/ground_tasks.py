@@ -169,6 +169,7 @@ def ground_setup(config: Config) -> GroundSetup:
         lease_s=config.output.lease_s,
         has_servo_outputs=needs_autopilot(config),
         has_estop_line=config.safety.estop_line is not None,
+        rc_channel=limits.rc_channel,
     )
 
 

@@ -15,8 +15,9 @@ from enum import StrEnum
 from itertools import pairwise
 from typing import Any
 
-from companion.core.inputs import MISSION_MODES
+from companion.core.inputs import MISSION_MODES, RcReport
 from companion.core.nozzle import NozzleSet
+from companion.core.safety import RC_LOW_US
 from companion.core.schedule import LagModel
 from companion.core.types import (
     DrivePlan,
@@ -248,6 +249,7 @@ class GroundSetup:
     lease_s: float = 0.3
     has_servo_outputs: bool = False
     has_estop_line: bool = False
+    rc_channel: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -325,7 +327,7 @@ def ground_reasons(setup: GroundSetup, state: GroundState, now_s: float) -> froz
         found.append(GroundReason.MISSION_ACTIVE)
     if state.output is None or state.output.healthy is not True:
         found.append(GroundReason.OUTPUT_FAULT)
-    if state.was_stopped is not False:
+    if state.was_stopped is not False or setup.rc_channel in state.turned_off:
         found.append(GroundReason.STOPPED)
     if setup.has_estop_line and state.estop_line is not False:
         found.append(GroundReason.ESTOP_UNKNOWN)
@@ -481,7 +483,8 @@ class GroundState:
 
     `mission_active` is what MISSION_CURRENT says, `None` where it does not say. `estop_line` is
     whether the switch on a line is pressed. `was_stopped` stays: whoever presses it, or enables,
-    disables or stops by MAVLink, wants something else than ground work.
+    disables or stops by MAVLink, wants something else than ground work. `turned_off` are channels
+    of the pilot's that were on and are off since, or lost: one that was never on says nothing.
     """
 
     heartbeat: HeartbeatReport | None = None
@@ -490,6 +493,16 @@ class GroundState:
     mission_active: bool | None = None
     estop_line: bool | None = None
     was_stopped: bool = False
+    rc: RcReport | None = None
+    turned_off: frozenset[int] = frozenset()
+
+
+def _rc(state: GroundState, item: RcReport) -> GroundState:
+    on = frozenset(channel for channel, us in enumerate(item.pulse_us, 1) if us >= RC_LOW_US)
+    if state.rc is None:
+        return replace(state, rc=item)
+    was_on = {channel for channel, us in enumerate(state.rc.pulse_us, 1) if us >= RC_LOW_US}
+    return replace(state, rc=item, turned_off=(state.turned_off | was_on) - on)
 
 
 def _estop(state: GroundState, item: EstopReport) -> GroundState:
@@ -502,6 +515,7 @@ _OBSERVED: dict[type, Callable[[GroundState, Any], GroundState]] = {
     HeartbeatReport: lambda state, item: replace(state, heartbeat=item),
     LandedReport: lambda state, item: replace(state, landed=item),
     OutputReport: lambda state, item: replace(state, output=item),
+    RcReport: _rc,
     EstopReport: _estop,
     OperatorCommand: lambda state, _: replace(state, was_stopped=True),
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from datetime import UTC, date, datetime
 from pathlib import Path
@@ -99,6 +100,13 @@ def test_the_flight_map_is_named_with_its_age_and_what_was_found() -> None:
     found = of_map()["flight-map"]
     assert found.status is Status.WARN
     assert "of prescription.shp, compiled 0 days ago; 1 finding, the first: 120.0 m2" in found.text
+
+
+def test_the_map_has_the_hash_that_map_check_tells(capsys: Captured) -> None:
+    assert execute(["map", "check", str(EXAMPLE / "prescription.shp")]) == 0
+    (told,) = re.findall("EPSG:4326, hash ([0-9a-f]{8})\n", capsys.readouterr().out)
+    assert of_map(f"prescription.sha256={told}")["map"].text.endswith(f", hash {told}")
+    assert of_map("prescription.sha256=01234567")["map"].status is Status.FAIL
 
 
 def test_a_refused_configuration_says_what_to_write() -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from companion.core.inputs import RcReport
 from companion.core.nozzle import FlowCurve, NozzleSet
 from companion.core.types import (
     EstopReport,
@@ -180,6 +181,39 @@ def test_an_emergency_stop_that_is_wired_must_be_heard() -> None:
     setup = GroundSetup(has_estop_line=True)
     assert Bench(setup=setup).run(NOW_S + 0.5).reasons == {GroundReason.ESTOP_UNKNOWN}
     assert not Bench(setup=setup).run(NOW_S + 0.5, estop_line=False).plan.is_off
+
+
+def switched(state: GroundState, *pulses_us: tuple[int, ...]) -> GroundState:
+    for pulse_us in pulses_us:
+        state = observe_ground(state, RcReport(received_s=NOW_S, pulse_us=pulse_us))
+    return state
+
+
+ON, MIDDLE, OFF, LOST = (1500, 1900), (1500, 1500), (1500, 1000), (0, 0)
+
+
+@pytest.mark.parametrize("last", [OFF, LOST, ()])
+def test_turning_the_switch_off_ends_ground_work_until_it_is_on_again(
+    last: tuple[int, ...],
+) -> None:
+    setup = GroundSetup(rc_channel=2)
+    on = switched(state_at(NOW_S), OFF, ON, MIDDLE)
+    off = switched(on, last)
+    bench = Bench(setup=setup).opened()
+    assert not bench.step(NOW_S + 0.55, turned_off=on.turned_off).plan.is_off
+    stopped = bench.step(NOW_S + 0.6, turned_off=off.turned_off)
+    assert (stopped.plan.is_off, stopped.is_over) == (True, True)
+    assert stopped.reasons == {GroundReason.STOPPED}
+    assert switched(off, OFF).turned_off >= {2}
+    assert 2 not in switched(off, ON).turned_off
+
+
+def test_a_switch_that_was_never_on_or_is_not_configured_stops_nothing() -> None:
+    off = switched(state_at(NOW_S), OFF, LOST, OFF)
+    decision = Bench(setup=GroundSetup(rc_channel=2)).run(NOW_S + 0.5, turned_off=off.turned_off)
+    assert not decision.plan.is_off
+    turned = switched(state_at(NOW_S), ON, OFF)
+    assert not Bench().run(NOW_S + 0.5, turned_off=turned.turned_off).plan.is_off
 
 
 @pytest.mark.parametrize(

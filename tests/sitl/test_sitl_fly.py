@@ -160,6 +160,7 @@ def with_map(folder: Path, *, rate_l_ha: float) -> Path:
         ({"seed": -1}, "--seed -1"),
         ({"plant": "no-such"}, "no sprayer profile 'no-such'"),
         ({"mission": Path("missing.plan")}, "missing.plan"),
+        ({"overrides": ("output.kind=none",)}, "moves no valve; give --output gpio or servo"),
     ],
 )
 def test_what_does_not_go_together_is_refused(

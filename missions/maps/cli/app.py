@@ -380,8 +380,10 @@ LINE_MAX = 500
 
 def report_lines(file: Path, result: Mapping[str, Any]) -> list[str]:
     """Return the lines for a person."""
+    digest = result["sha256"]
     return [
-        f"{_judged(file)}: {result['format']}, {result['crs']}",
+        f"{_judged(file)}: {result['format']}, {result['crs']}"
+        + (f", hash {digest[:8]}" if digest else ""),
         _extent(result),
         _rates(result),
         _amount(result),
