@@ -20,7 +20,13 @@ from companion.errors import MapError
 from companion.wording import counted
 from missions.errors import PlanError
 from missions.files.fence import Fences, Ground, fence_warnings
-from missions.files.write import check_suffix, older_sorties, write_fleet
+from missions.files.write import (
+    check_suffix,
+    lines_beside,
+    older_files,
+    stale_warnings,
+    write_fleet,
+)
 from missions.maps.cli.new import parse_mark
 from missions.maps.cli.options import Reading, reading_options
 from missions.maps.model import check_folder
@@ -205,7 +211,7 @@ def plan(
         typer.Option(metavar="L", help="Mix already in the tank before the first sortie.", min=0.0),
     ] = 0.0,
     force: Annotated[
-        bool, typer.Option("--force", help="Replace a plan of this name, with all its sorties.")
+        bool, typer.Option("--force", help="Replace a plan of this name, with all its files.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -291,9 +297,11 @@ def plan(
         choices = _priced(planned, task)
     goes_on = resume is not None or done is not None
     mix = mix_of(reading.config, planned, task.rates, goes_on=goes_on)
+    lines_before = lines_beside(out)
     with _undisturbed():
         files, marks = write_fleet(planned, out, with_sprayer=sprayer, fences=fences)
-    removed = _removed(older_sorties(out, files))
+    removed = _removed(older_files(out, [*files, *marks]))
+    stale = stale_warnings(out, lines_before)
     if png is not None:
         draw_plan(planned, png, title=field.stem)
     if is_fenced:
@@ -319,6 +327,7 @@ def plan(
     warnings = (
         *warnings,
         *overlap_warnings(planned, result["overlap_litres_percent"], is_stopped=watch.stopped),
+        *stale,
     )
     result["warnings"] = list(warnings)
     said = _choices(planned, result, [text for _, text in choices], asked=asks or sprayer)
@@ -402,25 +411,30 @@ def _undisturbed() -> Iterator[None]:
 
 
 def _removed(files: list[Path]) -> list[Path]:
-    """Remove sorties of the plan that was replaced: one of them would be flown for one of these."""
+    """Remove files of the plan that was replaced: one of them would be flown for one of these."""
     for path in files:
         try:
             path.unlink()
         except OSError as error:
             reason = (error.strerror or "cannot be removed").lower()
-            raise PlanError(f"{path}: a sortie of an earlier plan: {reason}; delete it") from error
+            raise PlanError(f"{path}: a file of an earlier plan: {reason}; delete it") from error
     return files
 
 
-def _refuse_existing(out: Path) -> None:
-    """Refuse to replace a plan, or to leave some of its sorties beside those of another."""
-    there = [*([out] if out.is_file() else []), *older_sorties(out, [out])]
-    if there:
-        verb = "are" if len(there) > 1 else "is"
-        raise PlanError(
-            f"{out.parent}: {names_of(there)} {verb} there already; give another --out, or "
-            "--force to replace this plan with all its sorties"
-        )
+def _refuse_existing(out: Path, beside: list[Path]) -> None:
+    """Refuse to replace a plan or what is `beside` it, or to mix its sorties with another's."""
+    older = [*([out] if out.is_file() else []), *older_files(out, [out])]
+    there = [path for path in older if path.suffix == out.suffix]
+    more = [path for path in (*older, *beside) if path not in there and path.is_file()]
+    if not there and not more:
+        return
+    names = " and ".join(names_of(paths) for paths in (there, more) if paths)
+    verb = "are" if len(there) + len(more) > 1 else "is"
+    where = "" if out.parent == Path() else f" in {out.parent}"
+    raise PlanError(
+        f"{names} {verb} there already{where}; give another --out, or --force to replace this "
+        "plan with all its files"
+    )
 
 
 def _own_rates(field: Path, rate_l_ha: float | None, reading: Reading) -> Path | None:
@@ -451,7 +465,7 @@ def _check_outputs(
         if path is not None:
             check_folder(path)
     if not force:
-        _refuse_existing(out)
+        _refuse_existing(out, [path for path in (png, pilot_sheet) if path is not None])
 
 
 def _choices(planned: Plan, result: dict[str, Any], prices: list[str], *, asked: bool) -> list[str]:

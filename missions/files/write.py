@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,7 @@ from missions.plan import Leg, Place, Plan, Sortie
 
 ONE_SORTIE = (".plan", ".waypoints")
 FORMATS = (*ONE_SORTIE, ".geojson", ".kml")
+LINES_SUFFIX = ".lines.geojson"
 
 
 def check_suffix(out: Path) -> None:
@@ -72,14 +73,40 @@ def lines_path(out: Path) -> Path | None:
     suffix = out.suffix.casefold()
     if suffix == ".geojson":
         return out
-    return out.with_name(f"{out.stem}.lines.geojson") if suffix in ONE_SORTIE else None
+    return out.with_name(out.stem + LINES_SUFFIX) if suffix in ONE_SORTIE else None
 
 
-def older_sorties(out: Path, written: Sequence[Path]) -> list[Path]:
-    """Return missions that are named as if they were more sorties of this plan."""
+def older_files(out: Path, written: Sequence[Path]) -> list[Path]:
+    """Return files that are named as if they were more sorties of this plan, or its lines."""
     if out.suffix.casefold() not in ONE_SORTIE:
         return []
-    names = re.compile(re.escape(out.stem) + r"(-a\d+)?(-\d+)?" + re.escape(out.suffix))
+    ends = rf"((-\d+)?{re.escape(out.suffix)}|{re.escape(LINES_SUFFIX)})"
+    return _named(out, ends, written)
+
+
+def stale_warnings(out: Path, before: Mapping[Path, bytes]) -> list[str]:
+    """Warn of missions of the other format whose lines file is no longer the one they came with."""
+    now = lines_beside(out)
+    if all(now.get(path) == content for path, content in before.items()):
+        return []
+    others = "|".join(re.escape(suffix) for suffix in ONE_SORTIE if suffix != out.suffix.casefold())
+    return [
+        f"{path.name} is of an earlier plan whose lines file is gone: valves would stay closed on "
+        "its passes; plan it again or delete it"
+        for path in _named(out, rf"(-\d+)?({others})", ())
+    ]
+
+
+def lines_beside(out: Path) -> dict[Path, bytes]:
+    """Return the files of lines that have the name of this plan, with their content."""
+    if out.suffix.casefold() not in ONE_SORTIE:
+        return {}
+    return {path: path.read_bytes() for path in _named(out, re.escape(LINES_SUFFIX), ())}
+
+
+def _named(out: Path, ends: str, written: Sequence[Path]) -> list[Path]:
+    """Return the files beside a plan that have its name, for any aircraft, and one of the ends."""
+    names = re.compile(rf"{re.escape(out.stem)}(-a\d+)?{ends}")
     found = [
         path
         for path in out.parent.iterdir()

@@ -395,6 +395,38 @@ def test_a_plan_that_is_there_is_replaced_with_force_alone_and_as_a_whole(
     assert "m-2.plan, m-3.plan" in err
 
 
+def test_lines_of_another_plan_are_replaced_with_force_alone(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    field = written(box(0.0, 0.0, 100.0, 60.0), tmp_path / "field.geojson")
+    run(capsys, field, "--out", "q.plan")
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    turned = [field, "--angle-deg", 20, "--out", "q.waypoints"]
+    code, refused, _ = run(capsys, *turned, "--no-force")
+    assert code == 2
+    assert refused["error"].startswith("q.lines.geojson is there already; give another --out, or")
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+    code, found, _ = run(capsys, *turned)
+    assert code == 0
+    assert any(warning.startswith("q.plan is of an earlier") for warning in found["warnings"])
+    _, again, _ = run(capsys, field, "--angle-deg", 20, "--out", "q.plan")
+    assert not any("earlier plan" in warning for warning in again["warnings"])
+
+
+@pytest.mark.parametrize(("option", "name"), [("--png", "p.png"), ("--sheet", "p.txt")])
+def test_what_is_beside_a_plan_is_replaced_with_force_alone(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, option: str, name: str
+) -> None:
+    field = written(box(0.0, 0.0, 100.0, 60.0), tmp_path / "field.geojson")
+    (tmp_path / name).write_text("mine")
+    words = [field, "--out", tmp_path / "m.plan", option, tmp_path / name]
+    code, refused, _ = run(capsys, *words, "--no-force")
+    assert (code, (tmp_path / name).read_text()) == (2, "mine")
+    assert f"{name} is there already in {tmp_path}" in refused["error"]
+    assert not (tmp_path / "m.plan").exists()
+
+
 def test_a_prescription_given_as_the_field_has_the_rates_too(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
