@@ -147,9 +147,8 @@ def query(
 
     Tables: flights, closings, faults, valves, damaged.
     """
-    from analysis.fleet.asking import asked
+    from analysis.fleet.asking import asked, check_out, lines_of, rows_of, write_table
     from analysis.fleet.store import Store
-    from analysis.fleet.tables import check_out, lines_of, rows_of, write_table
 
     if out is not None:
         check_out(out)

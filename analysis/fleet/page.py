@@ -11,8 +11,8 @@ import pyarrow as pa
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
+from analysis.fleet.asking import csv_of, parquet_of
 from analysis.fleet.summary import FIGURES, GROUPS
-from analysis.fleet.tables import csv_of, parquet_of
 from analysis.report.build import FILTERS, embedded
 
 # What stands in a table of the page; the files have all.
