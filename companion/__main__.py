@@ -16,10 +16,10 @@ _INTERRUPTED = 130
 
 def main() -> None:
     """Run the command line of this process and leave with its exit code."""
-    before = signal.signal(signal.SIGINT, _leave)
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _leave)
     from companion.cli import main as run
 
-    signal.signal(signal.SIGINT, before)
     run()
 
 

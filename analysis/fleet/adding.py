@@ -240,6 +240,7 @@ class _Pool:
         with _no_module_of_this_folder():
             if self._pool is None:
                 self._pool = _started(self._processes)
+        with _no_module_of_this_folder(), _interrupt_held_back():
             futures: dict[Future[_Done], _Task] = {
                 self._pool.submit(work, each): each for each in tasks
             }
@@ -284,16 +285,25 @@ def _no_module_of_this_folder() -> Iterator[None]:
             os.environ[_SAFE_PATH] = before
 
 
+@contextmanager
+def _interrupt_held_back() -> Iterator[None]:
+    """Start processes that Ctrl-C never reaches, from their first moment: they inherit the mask."""
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+
 def _started(processes: int) -> ProcessPoolExecutor:
     context = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(processes, mp_context=context, initializer=_end_with_parent)
 
 
 def _end_with_parent() -> None:
-    """Leave Ctrl-C to the parent, and end when it does, also by a kill."""
+    """End when the parent does, also by a kill."""
     import analysis.fleet.flight_row  # noqa: F401
 
     # What is imported by now stays: the garbage of each flight is looked for among its own.
     gc.freeze()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -7,15 +7,19 @@ a map that is refused, with the list of problems that `map check` prints.
 
 from __future__ import annotations
 
+import _thread
 import errno
 import json
 import os
+import signal
 import sys
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -213,16 +217,40 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """
     if arguments is None:
         arguments = sys.argv[1:]
-        try:
-            give_way(arguments, _haste(arguments))
-        except KeyboardInterrupt:
-            sys.exit(_fail("interrupted", INTERRUPTED, as_json="--json" in arguments))
+        haste = _haste(arguments)
+        give_way(arguments, haste)
         # The companion's own commands draw nothing.
         if not arguments or arguments[0] not in COMMANDS:
             from companion.cli.folders_own import ignore_the_folders_own
 
             ignore_the_folders_own()
+        if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+            # asyncio has its own way with Python's handler, and with no other.
+            is_quick = haste == "at-once"
+            signal.signal(signal.SIGINT, signal.default_int_handler if is_quick else _interrupt)
     sys.exit(execute(arguments))
+
+
+_IMPORT = "<frozen importlib._bootstrap>"
+_IMPORTED_S = 0.05
+_again: list[threading.Timer] = []
+
+
+def _interrupt(_number: int, frame: FrameType | None) -> None:
+    """Interrupt as Python does, but wait for the end of an import.
+
+    In the middle of one, a library makes another error of an interrupt (numpy an ImportError,
+    pydantic a SchemaError), or prints it.
+    """
+    while frame is not None:
+        if frame.f_code.co_filename == _IMPORT:
+            if not any(each.is_alive() for each in _again):
+                _again[:] = [threading.Timer(_IMPORTED_S, _thread.interrupt_main)]
+                _again[0].daemon = True
+                _again[0].start()
+            return
+        frame = frame.f_back
+    raise KeyboardInterrupt
 
 
 def _haste(arguments: Sequence[str]) -> Haste:

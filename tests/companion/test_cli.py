@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import importlib
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +19,7 @@ import click
 import pytest
 import typer
 
-from companion.cli.app import COMMANDS, app, execute, load_command, main
+from companion.cli.app import COMMANDS, _interrupt, app, execute, load_command, main
 from companion.cli.run import build_executor, component_options
 from companion.commands import Command, all_registered
 from companion.config import load
@@ -204,6 +207,7 @@ def test_interrupt_while_the_program_loads_is_one_line() -> None:
         "    def find_spec(self, name, path=None, target=None):\n"
         "        if name == 'typer': os.kill(os.getpid(), signal.SIGINT)\n"
         "sys.meta_path.insert(0, Press())\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from companion.__main__ import main\n"
         "main()\n"
     )
@@ -211,6 +215,29 @@ def test_interrupt_while_the_program_loads_is_one_line() -> None:
         [sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=60
     )
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
+
+
+def test_interrupt_in_the_middle_of_an_import_waits_for_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A library makes another error of it, as here one that nobody catches."""
+    (tmp_path / "half_imported.py").write_text(
+        "import os, signal, time\n"
+        "try:\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    time.sleep(0.1)\n"
+        "except KeyboardInterrupt:\n"
+        "    raise ImportError('half of it') from None\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    before = signal.signal(signal.SIGINT, _interrupt)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            importlib.import_module("half_imported")
+            time.sleep(30.0)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert "half_imported" in sys.modules
 
 
 def test_wrong_usage_with_json_is_one_object(capsys: Captured) -> None:
