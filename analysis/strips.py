@@ -170,10 +170,15 @@ class Strip:
         # Few stretches are sought among many times, not each time among the stretches.
         edges = np.concatenate(([0], np.searchsorted(time_s, starts_s), [len(time_s)]))
         found: Floats = np.repeat(rates, np.diff(edges))
-        if self.spared.any():
-            before, after = self._marks_around(time_s)
-            found[self.spared[before] & self.spared[after]] = 0.0
+        found[self.spared_at(time_s)] = 0.0
         return found
+
+    def spared_at(self, time_s: Floats) -> Bools:
+        """Return where nothing is asked for, as the ground was treated before, at any times."""
+        if not self.spared.any():
+            return np.zeros(len(time_s), dtype=np.bool_)
+        before, after = self._marks_around(time_s)
+        return self.spared[before] & self.spared[after]
 
     def inside_at(self, time_s: Floats) -> Bools:
         """Return where the strip lies in the field, but for `GRAZE_M`, at any times."""

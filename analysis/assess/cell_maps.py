@@ -3,7 +3,7 @@
 As its Figs. 10, 15, 16 and 17: maps on the map's own grid (else square cells of a stated size),
 relative error with small cells left blank, duty, histogram with mean and standard deviation. What
 is measured here is the record's volume, over the ground of the field that the strips passed in each
-cell. What was commanded is the map's rate where a cell lies in one zone, else the mean of what the
+cell, but for what they spared as treated before. What was commanded is the map's rate where a cell lies in one zone, else the mean of what the
 strips were to spray there.
 """
 
@@ -212,7 +212,10 @@ def _sums(grid: Grid, strips: Sequence[Strip], duties: Sequence[Floats], piece_m
     totals = np.zeros((6, grid.rows * grid.columns + 1))
     for strip, duty in zip(strips, duties, strict=True):
         slices = slices_of(strip, piece_m)
-        chosen = np.flatnonzero(slices.inside | (slices.given_ml > 1e-9))
+        # Closed over ground that was treated before, a strip takes no part: what fell there before
+        # is what came, not the mean of that and nothing.
+        passed = slices.inside & ~strip.spared_at(slices.time_s)
+        chosen = np.flatnonzero(passed | (slices.given_ml > 1e-9))
         totals += summed(grid, slices, piece_m, _values(slices, duty), chosen)
     area, inside, asked_ml, given_ml, duty_m2, speed = (
         total[:-1].reshape(grid.rows, grid.columns) for total in totals

@@ -236,6 +236,27 @@ def test_a_cell_in_one_zone_is_to_get_the_rate_of_that_zone(cell_m: float, north
         assert cells.commanded_l_ha[passed][within] == pytest.approx(zone.rate_l_ha, rel=1e-6)
 
 
+def test_a_valve_that_spares_treated_ground_leaves_every_cell_its_dose() -> None:
+    record = record_of(eastwards())
+    strips = strips_of(record)
+    duties = [np.zeros(len(record.time_s)) for _ in strips]
+    once = cell_maps(record, strips, duties)
+    again = [
+        replace(
+            each,
+            track=replace(each.track, volume_ml=np.zeros_like(each.track.volume_ml)),
+            spared=np.ones_like(each.spared),
+        )
+        for each in strips
+    ]
+    both = cell_maps(record, [*strips, *again], duties * 2)
+    assert once is not None
+    assert both is not None
+    assert np.nanmax(once.measured_l_ha) > 10.0
+    np.testing.assert_allclose(both.measured_l_ha, once.measured_l_ha)
+    np.testing.assert_allclose(both.commanded_l_ha, once.commanded_l_ha)
+
+
 # -------------------------------------------------------------------------------------- causes
 
 
