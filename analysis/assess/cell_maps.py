@@ -3,8 +3,8 @@
 As its Figs. 10, 15, 16 and 17: maps on the map's own grid (else square cells of a stated size),
 relative error with small cells left blank, duty, histogram with mean and standard deviation. What
 is measured here is the record's volume, over the ground of the field that the strips passed in each
-cell, but for what they spared as treated before. What was commanded is the map's rate where a cell lies in one zone, else the mean of what the
-strips were to spray there.
+cell, but for what they spared as treated before. What was commanded is the map's rate where a cell
+lies in one zone, else the mean of what the strips were to spray there.
 """
 
 from __future__ import annotations
