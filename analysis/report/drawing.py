@@ -292,7 +292,7 @@ def _ends(mean: Interval) -> tuple[float, ...]:
 
 def _name(group: Group) -> str:
     assert group.low is not None and group.high is not None
-    return f"{group.low:g}" if group.low == group.high else f"{group.low:g}\nto {group.high:g}"
+    return f"{group.low:g}" if group.low == group.high else f"{group.low:g}\nto\n{group.high:g}"
 
 
 # How far the ground is from what was asked: a histogram; and what the off-rate area is due to.
