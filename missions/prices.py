@@ -90,7 +90,7 @@ def lines_warnings(plan: Plan, config: Config | None) -> tuple[str, ...]:
         return ()
     more_l = share * plan.volume_l
     return (
-        "the litres count on valves that close over ground sprayed before, which they do only with "
+        "the litres assume valves that close over ground sprayed before, which they do only with "
         f"mission.lines set; without it up to {more_l:.1f} L more fall, and the tank may run empty",
     )
 

@@ -288,7 +288,7 @@ def by_inhibit(flight: AppliedFlight, marks: Marks, where: Bools) -> dict[str, f
     for reason, then, area in zip(
         reasons.tolist(), later.tolist(), marks.area_m2[where].tolist(), strict=True
     ):
-        name = reason or then or "a reason just over"
+        name = reason or then or "a condition that had just ended"
         found[name] = found.get(name, 0.0) + area
     return found
 

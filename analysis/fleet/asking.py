@@ -49,6 +49,7 @@ _VIEWS = (
     "CREATE VIEW valves AS SELECT flight_id, kind, month, machine, started_utc, each.valve, "
     "each.flow_factor FROM flights, UNNEST(valves) AS t(each)",
 )
+_TABLES = "flights, closings, faults, valves, damaged"
 # Two writers at once left a flight in two files, or in two months.
 _NEWEST = " QUALIFY row_number() OVER (PARTITION BY flight_id ORDER BY record_version DESC) = 1"
 
@@ -77,7 +78,10 @@ class Fleet:
                 "SQL: the query needs too much memory; allow more with --memory-mb"
             ) from error
         except duckdb.Error as error:
-            raise ConfigError(f"SQL: {_line(error)}") from error
+            text = _line(error)
+            if "Table with name" in text:  # DuckDB's guesses are tables of its own
+                text = f"{text.partition('Did you mean')[0].rstrip(' !')}; the tables: {_TABLES}"
+            raise ConfigError(f"SQL: {text}") from error
 
 
 @contextmanager

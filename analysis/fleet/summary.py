@@ -56,7 +56,7 @@ FIGURES = (
         "count(*) FILTER (NOT is_evaluated)",
         "not evaluated",
         0,
-        "flights that were added with --quick: lags, changes and missed ground are not known",
+        "flights whose lags, changes and missed ground are not known yet",
     ),
     Figure("hours", "sum(duration_s) / 3600", "h", 1, "hours recorded"),
     Figure("area_ha", "sum(area_ha)", "ha", 2, "ground treated, flight by flight"),

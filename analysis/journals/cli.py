@@ -195,8 +195,8 @@ def show(
 ) -> None:
     """Show what a journal records about its flight, and how much it holds.
 
-    Exit 0: all can be read; 1: it is damaged or of another version, and what could not be read is
-    said; 2: no journal, or its flight still writes it.
+    Exit 0: all can be read; 1: it is damaged or of another version, and what could not be read
+    is listed; 2: no journal, or its flight still writes it.
     """
     flight = look_at(path)
     if flight.state == "open" or not path.is_file():

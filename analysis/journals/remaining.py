@@ -55,8 +55,8 @@ def remaining(
 
     What is left in pieces narrower than half a valve's strip does not count: no valve is for that.
 
-    Exit 0: all was read; 1: a journal is damaged or of another version, and what of it could not be
-    read is said; 2: no journal, or none that keeps treated ground.
+    Exit 0: all was read; 1: a journal is damaged or of another version, and what could
+    not be read is listed; 2: no journal, or none that keeps treated ground.
     """
     flights = sorted((_treated(path) for path in journals), key=_started)
     last = flights[-1]

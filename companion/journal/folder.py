@@ -34,7 +34,13 @@ from companion.journal.read_only import (
     read_only,
     salvaged_name,
 )
-from companion.journal.reader import OpenJournal, OtherVersionError, check_version, opened
+from companion.journal.reader import (
+    NoJournalError,
+    OpenJournal,
+    OtherVersionError,
+    check_version,
+    opened,
+)
 from companion.journal.writer import SET_META, applied_l, tell_times_again, totals_of
 from companion.simulated import Simulated, simulated_in
 
@@ -156,6 +162,8 @@ def set_pinned(path: Path, *, is_pinned: bool) -> bool:
     """Pin a flight, or no longer; return whether that was news."""
     if not path.is_file():
         raise JournalError(f"{path}: there is no such file; give the .gpkg file of a flight")
+    if is_pinned:
+        _refuse_others(path)
     pin = pin_of(path)
     if pin.exists() == is_pinned:
         return False
@@ -167,6 +175,17 @@ def set_pinned(path: Path, *, is_pinned: bool) -> bool:
     except OSError as error:
         raise JournalError(f"{pin}: cannot be written ({error.strerror})") from error
     return True
+
+
+def _refuse_others(path: Path) -> None:
+    """Refuse what is no journal; one that is damaged, or that is still written, can be pinned."""
+    try:
+        with opened(path, is_lenient=True):
+            pass
+    except NoJournalError:
+        raise
+    except JournalError:
+        return
 
 
 # The newest flights stay by every rule: a disk that something else has filled, or a clock that is

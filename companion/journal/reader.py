@@ -42,10 +42,16 @@ _OWN = frozenset(
     {"meta", "records", "blocks", "events", "zones", "field", "applied", "valve_changes"}
 )
 _SOME = 3
+# A flight map has the ground's tables too, and these of its own.
+_OF_A_MAP = frozenset({"source_rates", "sources"})
 _GIVE = "give the .gpkg file of a flight"
 SEE_SHOW = "; see vrspray flights show"
 # SQLite's words for a file that is not to be had; whatever else it says is damage.
 _KEPT_BACK = ("unable to open", "readonly", "access permission", "authorization")
+
+
+class NoJournalError(JournalError):
+    """The file is something else, not a journal."""
 
 
 def refused(path: Path, error: Exception) -> JournalError:
@@ -61,7 +67,7 @@ def refused(path: Path, error: Exception) -> JournalError:
     if isinstance(error, PermissionError):
         return JournalError(f"{path}: cannot be read: {text}")
     if isinstance(error, sqlite3.DatabaseError) and "not a database" in text:
-        return JournalError(f"{path}: this is not a journal; {_GIVE}")
+        return NoJournalError(f"{path}: this is not a journal; {_GIVE}")
     return UnreadableError(f"{path}: is damaged: {text}")
 
 
@@ -74,9 +80,11 @@ def no_file(path: Path) -> JournalError:
 def check_kind(name: object, tables: Collection[str], *, is_geopackage: bool) -> None:
     """Refuse what is no journal by its tables: another database, another GeoPackage."""
     if not is_geopackage:
-        raise JournalError(f"{name}: this is not a journal; {_GIVE}")
+        raise NoJournalError(f"{name}: this is not a journal; {_GIVE}")
+    if _OF_A_MAP.issubset(tables):
+        raise NoJournalError(f"{name}: this is a flight map, not a journal; {_GIVE}")
     if len(_OWN.intersection(tables)) < _SOME:
-        raise JournalError(f"{name}: this is a GeoPackage, but no journal of a flight")
+        raise NoJournalError(f"{name}: this is a GeoPackage, but no journal of a flight")
 
 
 def why_no_setup(error: Exception) -> str:

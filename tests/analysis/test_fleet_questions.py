@@ -188,6 +188,15 @@ def test_what_is_no_question_to_the_flights_is_refused_in_one_line(
     assert len(err.splitlines()) == 1
 
 
+def test_an_unknown_table_is_answered_by_the_names_of_ours(fleet: Path, capsys: Captured) -> None:
+    code, _, err = run(capsys, "query", "SELECT * FROM trips", "--fleet", str(fleet))
+    assert (code, err) == (
+        2,
+        "error: SQL: Catalog Error: Table with name trips does not exist; the tables: flights, "
+        "closings, faults, valves, damaged\n",
+    )
+
+
 def test_memory_has_a_limit(fleet: Path, capsys: Captured) -> None:
     sql = "SELECT list(a) FROM range(40000000) t(a)"
     code, _, err = run(capsys, "query", sql, "--fleet", str(fleet), "--memory-mb", "60")

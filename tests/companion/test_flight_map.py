@@ -565,3 +565,15 @@ def test_an_overlap_rule_that_is_none_is_refused_in_words(
     assert (
         "--overlap is one of error, max, min, mean, last, not 'refuse'" in capsys.readouterr().err
     )
+
+
+def test_a_flight_map_is_named_where_a_journal_is_wanted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written(tmp_path)
+    flight_map = tmp_path / "a.flightmap.gpkg"
+    assert execute(["flights", "show", str(flight_map)]) == 2
+    assert capsys.readouterr().err == (
+        f"error: {flight_map}: this is a flight map, not a journal; give the .gpkg file of a "
+        "flight\n"
+    )

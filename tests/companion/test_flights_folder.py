@@ -20,6 +20,7 @@ from companion.journal.folder import (
     chosen,
     journals,
     look_at,
+    pin_of,
     prune,
     set_pinned,
 )
@@ -133,6 +134,21 @@ def test_a_pin_is_a_file_beside_and_the_flight_is_not_touched(folder: Path) -> N
     assert (path.read_bytes(), path.stat().st_mtime_ns) == before
     with pytest.raises(JournalError, match="no such file"):
         set_pinned(folder / "flight-0009.gpkg", is_pinned=True)
+
+
+def test_what_is_no_journal_is_not_pinned(
+    tmp_path: Path, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    notes = tmp_path / "notes.txt"
+    notes.write_text("not a flight\n" * 100)
+    assert execute(["flights", "pin", str(notes)]) == 2
+    assert capsys.readouterr().err == (
+        f"error: {notes}: this is not a journal; give the .gpkg file of a flight\n"
+    )
+    assert not pin_of(notes).exists()
+    damaged = folder / "flight-0001.gpkg"
+    damaged.write_bytes(damaged.read_bytes()[:20_000])
+    assert set_pinned(damaged, is_pinned=True)
 
 
 def test_a_log_beside_a_flight_goes_with_it(folder: Path) -> None:
