@@ -283,10 +283,23 @@ def execute(arguments: Sequence[str]) -> int:
     return result if isinstance(result, int) else 0
 
 
+# What the library says of an option that is no number, and how it is put here.
+_PLAINLY = {
+    "Input should be a valid number, unable to parse string as a number": (
+        "write a number, with a point for decimals: 20.5"
+    ),
+    "Input should be a valid integer, unable to parse string as an integer": (
+        "write a whole number, such as 2"
+    ),
+}
+
+
 def _ended(error: BaseException, *, as_json: bool) -> int:
     """Say what ended a command, in one line, and return the exit code."""
     if isinstance(error, typer.TyperException):
         said = error.format_message().rstrip(".")
+        for foreign, ours in _PLAINLY.items():
+            said = said.replace(foreign, ours)
         return _fail(f"{said} (see --help)", error.exit_code, as_json=as_json)
     if isinstance(error, VrsprayError):
         code = FAILED if isinstance(error, ActuatorError | UnreadableError) else REFUSED

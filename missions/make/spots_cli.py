@@ -433,8 +433,8 @@ def _lines(result: dict[str, Any]) -> list[str]:
     ]
     if result["exposed"]:
         lines.append(
-            f"{counted(result['exposed'], 'weed')} of them so near to ground that is not sprayed "
-            "that errors miss more often"
+            f"{counted(result['exposed'], 'weed')} of them close to ground that is not sprayed: "
+            "position errors are more likely to miss there"
         )
     if result["beyond"]:
         lines.append(f"{counted(result['beyond'], 'weed')} outside of the field left out")

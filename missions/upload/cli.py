@@ -201,9 +201,13 @@ def read_mission_file(path: Path) -> MissionFile:
     try:
         if path.stat().st_size > BYTES_MAX:
             raise UploadError(f"{path}: too large for a mission")
-        found = reader(path, path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        if not text.strip():
+            raise UploadError(f"{path}: the file is empty; write it again with vrspray plan --out")
+        found = reader(path, text)
     except OSError as error:
-        raise UploadError(f"{path}: {error.strerror or error}") from error
+        fix = "check its name and folder"
+        raise UploadError(f"{path}: {(error.strerror or str(error)).lower()}; {fix}") from error
     except RecursionError as error:
         raise UploadError(f"{path}: not a mission: too deep") from error
     except UnicodeDecodeError as error:

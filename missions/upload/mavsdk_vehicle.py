@@ -8,6 +8,7 @@ import json
 import logging
 from collections.abc import AsyncGenerator, AsyncIterator, Sequence
 from contextlib import aclosing, asynccontextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 from companion.errors import LinkError
@@ -71,11 +72,7 @@ async def connected(url: str, *, wait_s: float) -> AsyncIterator[MavsdkVehicle]:
         try:
             await client.add_any_connection(target)
         except MavsdkError as error:
-            taken = "BIND" in str(error)
-            fix = (
-                "another program holds this port; end it, or give another" if taken else str(error)
-            )
-            raise LinkError(f"--link {url}: cannot be opened: {fix}") from error
+            raise LinkError(f"--link {url}: cannot be opened: {_fix(url, str(error))}") from error
         system = await client.first_autopilot(wait_s)
         if system is None:
             raise LinkError(
@@ -83,6 +80,22 @@ async def connected(url: str, *, wait_s: float) -> AsyncIterator[MavsdkVehicle]:
                 "and does another program hold the link?"
             )
         yield MavsdkVehicle(system, await _firmware(system, url))
+
+
+def _fix(url: str, text: str) -> str:
+    """Return what to do about a link that MAVSDK does not open; its own text says no more.
+
+    >>> _fix("tcp:10.0.0.9:5760", "Connection failed: CONNECTION_ERROR")
+    'nobody answers there; check the address, and that the vehicle or its radio is on'
+    """
+    if "BIND" in text:
+        return "another program holds this port; end it, or give another"
+    parts = parse_url(url)
+    if parts.kind != "serial":
+        return "nobody answers there; check the address, and that the vehicle or its radio is on"
+    if not Path(parts.place).exists():
+        return "there is no such device; plug it in, and look for its name with ls /dev/tty*"
+    return "end the program that holds it, or join its group (dialout)"
 
 
 def _log(_level: object, text: str, _file: object, _line: int) -> bool:

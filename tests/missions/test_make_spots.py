@@ -247,7 +247,10 @@ def test_weeds_at_the_border_are_said_to_be_missed_more_often(
     weeds.write_text("\n".join(["lat,lon", *rows]) + "\n")
     words = [weeds, "--config", data / "config.toml", "--out", tmp_path / "s.gpkg", "--rate", "20"]
     typer.main.get_command(app).main([str(one) for one in words], standalone_mode=False)
-    assert "1 weed of them so near to ground that is not sprayed" in capsys.readouterr().out
+    assert (
+        "1 weed of them close to ground that is not sprayed: position errors"
+        in capsys.readouterr().out
+    )
 
 
 def test_weeds_of_another_field_are_refused(

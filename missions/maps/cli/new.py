@@ -178,9 +178,10 @@ def _numbers_of_place(
     text: str, option: str, form: str, counts: tuple[int, ...]
 ) -> tuple[float, ...]:
     numbers = parse_numbers(text, option)
+    high = ", the altitude in metres" if "ALT" in form.split(",") else ""
     if len(numbers) not in counts or not (abs(numbers[0]) <= 90.0 and abs(numbers[1]) <= 180.0):
         raise typer.BadParameter(
-            f"{option} is {text!r}; write {form} in degrees and metres, the latitude first"
+            f"{option} is {text!r}; write {form} in degrees, the latitude first{high}"
         )
     return numbers
 
