@@ -22,6 +22,7 @@ from missions.errors import PlanError
 from missions.files.fence import Fences, Ground, fence_warnings
 from missions.files.write import (
     check_suffix,
+    format_warnings,
     lines_beside,
     older_files,
     stale_warnings,
@@ -41,7 +42,7 @@ from missions.pilot_sheet import (
 )
 from missions.plan import LEAVE_PERCENT, Plan
 from missions.planner import plan_mission
-from missions.prices import Price, lines_warnings, overlap_warnings, prices, twice_hint
+from missions.prices import Price, lines_warnings, no_choices, overlap_warnings, prices, twice_hint
 from missions.reading import Asked, Task, assumed, names_of, read_task
 from missions.reading_fleet import BreakAsked
 from missions.reading_ground import Autopilot, GroundAsked, label_warnings, parse_run_in, parse_wind
@@ -295,6 +296,7 @@ def plan(
     is_whole = task.left is None and not isinstance(task.rates, UntreatedRates)
     if asks and is_whole and not watch.stopped:
         choices = _priced(planned, task)
+    none = [no_choices(planned)] if choices_too and is_whole and not watch.stopped else []
     goes_on = resume is not None or done is not None
     mix = mix_of(reading.config, planned, task.rates, goes_on=goes_on)
     lines_before = lines_beside(out)
@@ -327,10 +329,11 @@ def plan(
     warnings = (
         *warnings,
         *overlap_warnings(planned, result["overlap_litres_percent"], is_stopped=watch.stopped),
+        *format_warnings(planned, out),
         *stale,
     )
     result["warnings"] = list(warnings)
-    said = _choices(planned, result, [text for _, text in choices], asked=asks or sprayer)
+    said = _choices(planned, result, [text for _, text in choices] or none, asked=asks or sprayer)
     answer(
         result, [*_lines(planned, result, files), *(f"choice    {text}" for text in said)],
         as_json=as_json,
@@ -484,7 +487,7 @@ def _lines(planned: Plan, result: dict[str, Any], files: list[Path]) -> list[str
     minutes = sum(map(planned.airborne_s, planned.sorties)) / 60.0
     where = ", ".join(f"{lat:.6f} {lon:.6f}" for lat, lon in result["depots"])
     least_m = result["least_idle_m"]
-    idle = f", both {least_m / 1000:.2f} km at least in any order" if least_m >= 50.0 else ""
+    idle = f" (together at least {least_m / 1000:.2f} km, in any order)" if least_m >= 50.0 else ""
     lines = [
         f"{names_of(files)}: {counted(len(planned.sorties), 'sortie')}, {planned.volume_l:.1f} L, "
         f"{minutes:.0f} min in the air",
@@ -497,9 +500,11 @@ def _lines(planned: Plan, result: dict[str, Any], files: list[Path]) -> list[str
         f"depot     {where}{' (suggested)' if planned.suggested_depot else ''}",
     ]
     if result["lines_file"] is not None:
+        names = ", ".join(result["lines_files"])
+        name = "it" if len(result["lines_files"]) == 1 else "each aircraft's own"
         lines.append(
-            f"lines     {result['lines_file']}: name it as mission.lines in the configuration, and "
-            f"only they are sprayed{_once(planned)}"
+            f"lines     {names}: name {name} as mission.lines in the configuration, and only "
+            f"passes are sprayed{_once(planned)}"
         )
     lines += sortie_lines(planned, result)
     return lines if result["mix"] is None else [*lines, *mix_lines(result["mix"])]

@@ -30,7 +30,7 @@ from missions.paced import Paced, in_room, range_warnings, room_warnings
 from missions.plan import Leg, Plan, Settings, Sortie, flown_lines, nose_s, sortie_wh
 from missions.remaining import Remaining, UntreatedRates, demands_once
 from missions.searching import is_stopped, lines_are_drawn
-from missions.sheet import overlap_by_sortie_l, scheduled
+from missions.sheet import fleet_warnings, overlap_by_sortie_l, scheduled
 from missions.sorties import Flying, SortieSearch
 from missions.spacing import Spacing
 from missions.speeds import choices, chosen, crawl_warnings, short_warnings, stretches_of
@@ -222,7 +222,8 @@ def _planned(
         ),
         terrain=around.terrain,
     )
-    return scheduled(plan)
+    plan = scheduled(plan)
+    return replace(plan, warnings=(*plan.warnings, *fleet_warnings(plan)))
 
 
 def _lines(field: Field, settings: Settings) -> tuple[Floats, float]:

@@ -55,6 +55,13 @@ def prices(
             yield price, _words(price, now)
 
 
+def no_choices(plan: Plan) -> str:
+    """Return why there is no other choice to show."""
+    if not is_small(plan.field, plan.settings) or plan.settings.aircraft > 1:
+        return "none: --choices is for small fields and one aircraft"
+    return f"none: no option saves {LEAST_S:g} s of flight or {LEAST_L_PERCENT:g} % of the litres"
+
+
 def overlap_warnings(
     plan: Plan, overlap_litres_percent: float, *, is_stopped: bool = False
 ) -> tuple[str, ...]:

@@ -43,6 +43,7 @@ from missions.reading_ground import (
 )
 from missions.reading_outline import (
     Obstacle,
+    apart_warnings,
     check_near,
     near_area,
     outline_of,
@@ -171,9 +172,16 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
             offset_m=offset_m,
             opens=asked.opens,
         ),
-        said=tuple(said),
+        said=(*said, *_apart(whole, rates)),
         wind=asked.ground.wind or (None if mission is None else mission.wind),
     )
+
+
+def _apart(field: Field, rates: Rates) -> list[str]:
+    """Warn where a map is not of the field."""
+    if not isinstance(rates, MapRates):
+        return []
+    return apart_warnings(field.outline, rates.prescription)
 
 
 def _no_spray_areas(
@@ -478,7 +486,7 @@ class MapRates:
     """
 
     def __init__(self, prescription: Prescription) -> None:
-        self._prescription = prescription
+        self.prescription = prescription
         zones = [] if prescription.cells is not None else list(prescription.zones)
         polygons = np.array([zone.polygon for zone in zones], dtype=object)
         self._parts, owner = shapely.get_parts(polygons, return_index=True)
@@ -489,7 +497,7 @@ class MapRates:
     @property
     def field(self) -> BaseGeometry:
         """Return the ground outside of which nothing is sprayed."""
-        return self._prescription.field
+        return self.prescription.field
 
     def rates_at(self, east_m: Floats, north_m: Floats) -> Floats:
         """Return the rate at each place [L/ha]; NaN where there is none."""
@@ -504,8 +512,8 @@ class MapRates:
             inside = some[shapely.contains_xy(part, east_m[some], north_m[some])]
             rates[inside] = rate
             found[inside] += 1
-        has_default = self._prescription.default_rate_l_ha is not None
-        ask = (found > 1) | ((found == 0) & (has_default or self._prescription.cells is not None))
+        has_default = self.prescription.default_rate_l_ha is not None
+        ask = (found > 1) | ((found == 0) & (has_default or self.prescription.cells is not None))
         if ask.any():
-            rates[ask] = self._prescription.rates_at(east_m[ask], north_m[ask])
+            rates[ask] = self.prescription.rates_at(east_m[ask], north_m[ask])
         return rates

@@ -17,6 +17,7 @@ from shapely.errors import ShapelyError
 from shapely.geometry.base import BaseGeometry
 
 from companion.core.frame import WGS84, LocalFrame
+from companion.core.prescription import Prescription
 from companion.errors import MapError
 from missions.errors import PlanError
 from missions.maps.build import frame_for
@@ -81,6 +82,40 @@ def outline_of(
         if cells is None or cells.cells is None:
             raise
         return _of_cells(cells)
+
+
+# Beyond the hull of a map's zones, so that the ground between spots counts as mapped: a share of
+# the outline that a headland left out of the map does not come to (28 % of 2 ha with 10 m around);
+# a share of the map that its generous border does not; a lesser share of both, as offsets make it.
+BARE_SHARE, OUTSIDE_SHARE, SHIFTED_SHARE = 0.4, 0.5, 0.05
+
+
+def apart_warnings(outline: BaseGeometry, prescription: Prescription) -> list[str]:
+    """Warn where much of the field is not in the map or much of the map is not in the field.
+
+    >>> from companion.core.prescription import Zone
+    >>> field, zone = shapely.box(0, 0, 100, 100), shapely.box(90, 0, 190, 100)
+    >>> zones = [Zone(name="a", polygon=zone, rate_l_ha=20.0)]
+    >>> [line.split(":")[0] for line in apart_warnings(field, Prescription(zones))]
+    ['90 % of the outline lies beyond the map, and 90 % of the map outside the outline']
+    """
+    zones = np.array([zone.polygon for zone in prescription.zones], dtype=object)
+    if prescription.default_rate_l_ha is not None or not len(zones):
+        return []
+    mapped = shapely.convex_hull(shapely.multipolygons(shapely.get_parts(zones)))
+    bare = float(shapely.area(shapely.difference(outline, mapped)) / outline.area)
+    shapely.prepare(outline)
+    parted = zones[~shapely.contains_properly(outline, zones)]
+    outside_m2 = float(shapely.area(shapely.difference(parted, outline)).sum())
+    outside = outside_m2 / float(shapely.area(zones).sum())
+    if bare < BARE_SHARE and outside < OUTSIDE_SHARE and min(bare, outside) < SHIFTED_SHARE:
+        return []
+    bare_percent, outside_percent = (round(100.0 * share, 1) for share in (bare, outside))
+    return [
+        f"{bare_percent:g} % of the outline lies beyond the map, and {outside_percent:g} % of the "
+        "map outside the outline: ground without a rate is not sprayed; if the map should cover "
+        "the field, check that both are of this field, their CRS and offset_east_m"
+    ]
 
 
 def check_degrees(area: Area, path: Path) -> None:

@@ -128,6 +128,31 @@ def _apart_m(plan: Plan, one: Sortie, other: Sortie, ways: dict[int, LineString]
     return float(shapely.distance(first, second))
 
 
+def fleet_warnings(plan: Plan) -> tuple[str, ...]:
+    """Warn where aircraft that wait for each other take longer than one of them would alone.
+
+    One aircraft is reckoned to fly the same legs with as few sorties as its tank and battery allow.
+    """
+    count, sorties = len({sortie.aircraft for sortie in plan.sorties}), plan.sorties
+    if count < 2:
+        return ()
+    fewest = max(math.ceil(plan.volume_l / plan.settings.usable_l), 1)
+    used_wh = [plan.energy_wh(sortie) or 0.0 for sortie in sorties]
+    fewest = min(max(fewest, math.ceil(sum(used_wh) / _usable_wh(plan))), len(sorties))
+    spared_s = min(
+        plan.airborne_s(sortie) - sum(leg.seconds for leg in sortie.legs if leg.kind != "ferry")
+        for sortie in sorties
+    )
+    alone_s = sum(map(plan.airborne_s, sorties)) - (len(sorties) - fewest) * spared_s
+    alone_s += (fewest - 1) * plan.settings.refill_s
+    if plan.total_s <= alone_s:
+        return ()
+    return (
+        f"{count} aircraft wait for each other and take {plan.total_s / 60.0:.1f} min; one alone "
+        f"would take about {alone_s / 60.0:.1f} min (--aircraft, mission.aircraft)",
+    )
+
+
 def filled_of(plan: Plan) -> dict[int, dict[str, Any]]:
     """Return by its number what each sortie finds in tank and battery, and what is put in."""
     aboard = _Aboard(plan)

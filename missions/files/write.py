@@ -50,6 +50,16 @@ def check_suffix(out: Path) -> None:
         )
 
 
+def format_warnings(plan: Plan, out: Path) -> list[str]:
+    """Warn of a format that says less than the autopilot of the plan needs."""
+    if plan.settings.autopilot != "px4" or out.suffix.casefold() != ".waypoints":
+        return []
+    return [
+        f"{out.name}: a ground station sends PX4 a yaw of 0 with every waypoint of this format: "
+        "nose and boom stay pointed north; write a .plan, or send this file with vrspray upload"
+    ]
+
+
 def paths_of(out: Path, sorties: int) -> list[Path]:
     """Return the files that are written: of formats for one sortie, one for each.
 
@@ -90,10 +100,10 @@ def stale_warnings(out: Path, before: Mapping[Path, bytes]) -> list[str]:
     if all(now.get(path) == content for path, content in before.items()):
         return []
     others = "|".join(re.escape(suffix) for suffix in ONE_SORTIE if suffix != out.suffix.casefold())
-    return [
-        f"{path.name} is of an earlier plan whose lines file is gone: valves would stay closed on "
-        "its passes; plan it again or delete it"
-        for path in _named(out, rf"(-\d+)?({others})", ())
+    stale = [path.name for path in _named(out, rf"(-\d+)?({others})", ())]
+    return stale and [
+        f"{', '.join(stale)}: of an earlier plan whose lines file is gone: valves would stay "
+        "closed on its passes; plan it again or delete it"
     ]
 
 

@@ -154,6 +154,9 @@ BOW_TIE = Polygon([(0, 0), (100, 100), (100, 0), (0, 100)])
         (box(0, 0, 100, 100), ["--depot", "north"], "--depot"),
         (box(0, 0, 100, 100), ["--rate-l-ha", "0"], "rate above zero"),
         (box(0, 0, 100, 100), ["--rate-l-ha", "nan"], "--rate-l-ha"),
+        (box(0, 0, 100, 100), ["--rate-l-ha", "20,5"], "write a number, with a point for decimals"),
+        (box(0, 0, 100, 100), ["--aircraft", "two"], "'--aircraft': write a whole number"),
+        (box(0, 0, 100, 100), ["--depot", "11"], "write LAT,LON in degrees, the latitude first ("),
         (box(0, 0, 100, 100), ["--swath-m", "-6"], "--swath-m -6: write a number greater than"),
         (box(0, 0, 20, 20), ["--swath-m", "0.05"], "write a number greater than or equal to 0.3"),
         (box(0, 0, 900, 900), ["--swath-m", "0.5"], "passes or more, and a plan has 1000 at most"),
@@ -409,7 +412,7 @@ def test_lines_of_another_plan_are_replaced_with_force_alone(
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
     code, found, _ = run(capsys, *turned)
     assert code == 0
-    assert any(warning.startswith("q.plan is of an earlier") for warning in found["warnings"])
+    assert any(warning.startswith("q.plan: of an earlier plan") for warning in found["warnings"])
     _, again, _ = run(capsys, field, "--angle-deg", 20, "--out", "q.plan")
     assert not any("earlier plan" in warning for warning in again["warnings"])
 
@@ -425,6 +428,81 @@ def test_what_is_beside_a_plan_is_replaced_with_force_alone(
     assert (code, (tmp_path / name).read_text()) == (2, "mine")
     assert f"{name} is there already in {tmp_path}" in refused["error"]
     assert not (tmp_path / "m.plan").exists()
+
+
+@pytest.mark.parametrize(
+    ("zones", "says"),
+    [
+        ([box(190, 90, 300, 190)], "99.5 % of the outline lies beyond the map, and 99.1 % of"),
+        ([box(0, 0, 100, 100)], "50 % of the outline lies beyond the map, and 0 % of"),
+        ([box(15, 0, 215, 100)], "7.5 % of the outline lies beyond the map, and 7.5 % of"),
+        ([box(0, 0, 200, 600)], "0 % of the outline lies beyond the map, and 83.3 % of"),
+        ([box(10, 10, 190, 90)], None),  # a headland without a rate
+        ([box(5, 5, 15, 15), box(180, 5, 195, 15), box(5, 85, 195, 95)], None),  # spots
+        ([box(-20, -20, 220, 120)], None),
+    ],
+)
+def test_a_map_that_is_not_of_the_field_is_warned_of(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, zones: list[Polygon], says: str | None
+) -> None:
+    field = written(box(0.0, 0.0, 200.0, 100.0), tmp_path / "field.geojson")
+    features = [
+        {"type": "Feature", "properties": {"rate_l_ha": 20.0},
+         "geometry": json.loads(shapely.to_geojson(to_degrees(zone)))}
+        for zone in zones
+    ]  # fmt: skip
+    rates = tmp_path / "rates.geojson"
+    rates.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    code, found, _ = run(capsys, field, "--prescription", rates, "--out", tmp_path / "m.plan")
+    assert code == 0
+    warned = [warning for warning in found["warnings"] if "of the outline lies" in warning]
+    assert len(warned) == (says is not None)
+    if says is not None:
+        assert warned[0].startswith(says)
+
+
+def test_choices_that_change_nothing_are_said_to_be_none(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    field = written(box(0.0, 0.0, 80.0, 60.0), tmp_path / "field.geojson")
+    for ground, says in (
+        (60.0, "choice    none: no option saves"),
+        (300.0, "choice    none: --ch"),
+    ):
+        field = written(box(0.0, 0.0, 80.0, ground), tmp_path / "field.geojson")
+        words = ["plan", str(field), "--choices", "--force", "--out", str(tmp_path / "m.plan")]
+        assert execute(words) == 0
+        assert says in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("autopilot", "count"), [("px4", 1), ("ardupilot", 0)])
+def test_waypoints_for_px4_are_warned_of(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, autopilot: str, count: int
+) -> None:
+    field = written(box(0.0, 0.0, 100.0, 60.0), tmp_path / "field.geojson")
+    out = tmp_path / "m.waypoints"
+    _, found, _ = run(capsys, field, "--autopilot", autopilot, "--out", out)
+    assert sum("pointed north" in warning for warning in found["warnings"]) == count
+
+
+def test_two_aircraft_that_take_longer_than_one_are_warned_of(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    field = written(box(0.0, 0.0, 80.0, 60.0), tmp_path / "field.geojson")
+    (tmp_path / "m.lines.geojson").write_text("of an earlier plan")
+    two = ["plan", str(field), "--aircraft", "2", "--out", str(tmp_path / "m.plan"), "--force"]
+    assert execute(two) == 0
+    out, err = capsys.readouterr()
+    assert f"{tmp_path / 'm-a1.lines.geojson'}, {tmp_path / 'm-a2.lines.geojson'}: name" in out
+    assert not (tmp_path / "m.lines.geojson").exists()
+    assert "warning: 2 aircraft wait for each other and take 6." in err
+    _, one, _ = run(capsys, field, "--out", tmp_path / "m.plan")
+    reckoned = re.search(r"one alone would take about ([\d.]+) min", err)
+    assert reckoned is not None
+    assert float(reckoned[1]) * 60.0 == pytest.approx(one["total_s"], rel=0.2)
+    large = written(box(0.0, 0.0, 300.0, 300.0), tmp_path / "large.geojson")
+    _, found, _ = run(capsys, large, "--aircraft", 2, "--out", tmp_path / "l.plan")
+    assert not any("wait for each other" in warning for warning in found["warnings"])
 
 
 def test_a_prescription_given_as_the_field_has_the_rates_too(
