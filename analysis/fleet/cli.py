@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from companion.cli.answer import AsJson, answer, note, progress
 from companion.wording import counted
 
-FAILED, INTERRUPTED = 1, 130
+if TYPE_CHECKING:
+    from analysis.fleet.adding import Added
+
+FAILED, REFUSED, INTERRUPTED = 1, 2, 130
 SHOWN_MAX = 20
 # Below this nothing is to be seen.
 PROGRESS_AFTER_S = 2.0
@@ -64,7 +67,7 @@ def add(
     """Add journals to a fleet's data set.
 
     Adding a journal twice changes nothing; a longer copy replaces a shorter one.
-    Exit 0: all are in; 1: some could not be read, and are listed; 2: wrong input.
+    Exit 0: all are in; 1: some could not be read, and are listed; 2: wrong input, or no journal.
     """
     from analysis.fleet.adding import add as add_all
     from analysis.fleet.adding import journals_in
@@ -121,10 +124,16 @@ def add(
             "command again"
         )
     answer(result, lines, as_json=as_json)
+    raise typer.Exit(_exit_code(done))
+
+
+def _exit_code(done: Added) -> int:
     if done.is_interrupted:
-        raise typer.Exit(INTERRUPTED)
-    if done.problems:
-        raise typer.Exit(FAILED)
+        return INTERRUPTED
+    if not done.problems:
+        return 0
+    are_others = all(each.is_other for each in done.problems)
+    return REFUSED if are_others and len(done.problems) == done.journals else FAILED
 
 
 @app.command(

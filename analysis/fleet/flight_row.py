@@ -40,7 +40,7 @@ from companion.core.setup import Setup
 from companion.errors import JournalError, UnreadableError
 from companion.journal.coverage import read_coverage, read_treated
 from companion.journal.read_only import DAMAGE, log_of, one_line
-from companion.journal.reader import OpenJournal, opened
+from companion.journal.reader import NoJournalError, OpenJournal, opened
 from companion.journal.writer import applied_l
 from companion.simulated import simulated_in
 
@@ -122,11 +122,12 @@ def _read(
         is_damaged = isinstance(error, UnreadableError) or not isinstance(error, JournalError)
         text = str(error).removeprefix(f"{path}: ")
         if text.startswith(_NO_JOURNAL) and _is_cut_to_nothing(path):
-            is_damaged, text = True, "is damaged: nothing of it was written to the disk"
+            is_damaged, text = True, f"{_NO_JOURNAL}: nothing of it was written to the disk"
         return Problem(
             path=path,
             text=text if isinstance(error, JournalError) else f"is damaged: {text}",
             is_damaged=is_damaged,
+            is_other=isinstance(error, NoJournalError) and not is_damaged,
             journal_sha256=digest,
             flight_id=flight_id,
         )

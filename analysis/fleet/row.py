@@ -89,11 +89,12 @@ COLUMNS = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Problem:
-    """A journal that gave no row, and why; `is_damaged`: it is one all the same."""
+    """A file that gave no row, and why; `is_damaged`: it is a journal, `is_other`: it is none."""
 
     path: Path
     text: str
     is_damaged: bool
+    is_other: bool = False
     journal_sha256: str = ""
     flight_id: str | None = None
 

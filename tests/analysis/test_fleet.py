@@ -240,6 +240,15 @@ def test_damaged_journals_are_listed_and_the_others_are_in(
     assert taken([bad], fleet, evaluate=False).problems == ()
 
 
+def test_what_holds_no_journal_at_all_is_wrong_input(tmp_path: Path, capsys: Captured) -> None:
+    notes = tmp_path / "notes.txt"
+    notes.write_text("rain at noon\n" * 20)
+    assert execute(["fleet", "add", str(notes), "--into", str(tmp_path / "fleet")]) == 2
+    assert capsys.readouterr().err == (
+        f"not added: {notes}: this is not a journal; give the .gpkg file of a flight\n"
+    )
+
+
 @pytest.mark.parametrize("content", [b"", b"\0" * 70_000, b"SQLite f"])
 def test_a_journal_of_which_nothing_was_written_is_listed(
     several: list[Path], tmp_path: Path, content: bytes
@@ -251,7 +260,7 @@ def test_a_journal_of_which_nothing_was_written_is_listed(
     found = taken([several[0], *gone], tmp_path / "fleet", evaluate=False)
     assert found.added == 1
     assert {each.text for each in found.problems} == {
-        "is damaged: nothing of it was written to the disk"
+        "this is not a journal: nothing of it was written to the disk"
     }
     taken(gone, tmp_path / "fleet", evaluate=False)
     listed = rows(tmp_path / "fleet", "SELECT journal FROM damaged ORDER BY journal")
