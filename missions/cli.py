@@ -18,13 +18,14 @@ import typer
 from companion.cli.answer import AsJson, Tell, answer, note, progress
 from companion.errors import MapError
 from companion.wording import counted
-from missions.errors import PlanError
 from missions.files.fence import Fences, Ground, fence_warnings
 from missions.files.write import (
     check_suffix,
     format_warnings,
     lines_beside,
-    older_files,
+    names_of,
+    refuse_existing,
+    remove_older,
     stale_warnings,
     write_fleet,
 )
@@ -43,7 +44,7 @@ from missions.pilot_sheet import (
 from missions.plan import LEAVE_PERCENT, Plan
 from missions.planner import plan_mission
 from missions.prices import Price, lines_warnings, no_choices, overlap_warnings, prices, twice_hint
-from missions.reading import Asked, Task, assumed, names_of, read_task
+from missions.reading import Asked, Task, assumed, read_task
 from missions.reading_fleet import BreakAsked
 from missions.reading_ground import Autopilot, GroundAsked, label_warnings, parse_run_in, parse_wind
 from missions.reading_outline import CORRIDOR_MAX_M, RADIUS_MAX_M
@@ -302,7 +303,7 @@ def plan(
     lines_before = lines_beside(out)
     with _undisturbed():
         files, marks = write_fleet(planned, out, with_sprayer=sprayer, fences=fences)
-    removed = _removed(older_files(out, [*files, *marks]))
+    removed = remove_older(out, [*files, *marks])
     stale = stale_warnings(out, lines_before)
     if png is not None:
         draw_plan(planned, png, title=field.stem)
@@ -413,33 +414,6 @@ def _undisturbed() -> Iterator[None]:
         raise KeyboardInterrupt
 
 
-def _removed(files: list[Path]) -> list[Path]:
-    """Remove files of the plan that was replaced: one of them would be flown for one of these."""
-    for path in files:
-        try:
-            path.unlink()
-        except OSError as error:
-            reason = (error.strerror or "cannot be removed").lower()
-            raise PlanError(f"{path}: a file of an earlier plan: {reason}; delete it") from error
-    return files
-
-
-def _refuse_existing(out: Path, beside: list[Path]) -> None:
-    """Refuse to replace a plan or what is `beside` it, or to mix its sorties with another's."""
-    older = [*([out] if out.is_file() else []), *older_files(out, [out])]
-    there = [path for path in older if path.suffix == out.suffix]
-    more = [path for path in (*older, *beside) if path not in there and path.is_file()]
-    if not there and not more:
-        return
-    names = " and ".join(names_of(paths) for paths in (there, more) if paths)
-    verb = "are" if len(there) + len(more) > 1 else "is"
-    where = "" if out.parent == Path() else f" in {out.parent}"
-    raise PlanError(
-        f"{names} {verb} there already{where}; give another --out, or --force to replace this "
-        "plan with all its files"
-    )
-
-
 def _own_rates(field: Path, rate_l_ha: float | None, reading: Reading) -> Path | None:
     """Return the field's file where it is a prescription too and nothing else gives rates."""
     named = reading.config is not None and reading.config.prescription is not None
@@ -468,7 +442,7 @@ def _check_outputs(
         if path is not None:
             check_folder(path)
     if not force:
-        _refuse_existing(out, [path for path in (png, pilot_sheet) if path is not None])
+        refuse_existing(out, [path for path in (png, pilot_sheet) if path is not None])
 
 
 def _choices(planned: Plan, result: dict[str, Any], prices: list[str], *, asked: bool) -> list[str]:

@@ -147,7 +147,10 @@ def _planned(
     if isinstance(rates, UntreatedRates):
         rates = rates.rates
     if not sum(need.total_l for need in demand) > 0.0:
-        raise PlanError("no part of the field has a rate above zero; check the prescription")
+        raise PlanError(
+            "no part of the field has a rate above zero where a pass goes; check that the "
+            "prescription is of this field"
+        )
     given = _depots(field.frame, depots)
     crowding = crowded(lines, field, settings, apart=with_sprayer) if left is None else None
     lines_are_drawn()

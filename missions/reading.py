@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -463,16 +463,6 @@ def _settle_s(config: Config) -> float:
     lag = config.lag
     slowest_s = max(lag.on_s, lag.off_s, lag.up_s, lag.down_s) + lag.output_s
     return slowest_s + config.pwm_limits().period_s
-
-
-def names_of(paths: Sequence[Path]) -> str:
-    """Return the names of files for a line of text.
-
-    >>> names_of([Path("a/m.plan"), Path("a/m-2.plan"), Path("a/m-3.plan")])
-    'm.plan, m-2.plan, m-3.plan'
-    """
-    names = [path.name for path in paths]
-    return ", ".join(names if len(names) <= 3 else [names[0], names[1], "...", names[-1]])
 
 
 # The rates of a prescription at hundreds of thousands of places at once.

@@ -86,6 +86,44 @@ def lines_path(out: Path) -> Path | None:
     return out.with_name(out.stem + LINES_SUFFIX) if suffix in ONE_SORTIE else None
 
 
+def refuse_existing(out: Path, beside: Sequence[Path] = (), *, option: str = "--out") -> None:
+    """Refuse to replace a plan or what is `beside` it, or to mix its sorties with another's."""
+    older = [*([out] if out.is_file() else []), *older_files(out, [out])]
+    there = [path for path in older if path.suffix == out.suffix]
+    more = [path for path in (*older, *beside) if path not in there and path.is_file()]
+    if not there and not more:
+        return
+    names = " and ".join(names_of(paths) for paths in (there, more) if paths)
+    verb = "are" if len(there) + len(more) > 1 else "is"
+    where = "" if out.parent == Path() else f" in {out.parent}"
+    raise PlanError(
+        f"{names} {verb} there already{where}; give another {option}, or --force to replace "
+        "this plan with all its files"
+    )
+
+
+def remove_older(out: Path, written: Sequence[Path]) -> list[Path]:
+    """Remove files of the plan that was replaced: one of them would be flown for one of these."""
+    found = older_files(out, written)
+    for path in found:
+        try:
+            path.unlink()
+        except OSError as error:
+            reason = (error.strerror or "cannot be removed").lower()
+            raise PlanError(f"{path}: a file of an earlier plan: {reason}; delete it") from error
+    return found
+
+
+def names_of(paths: Sequence[Path]) -> str:
+    """Return the names of files for a line of text.
+
+    >>> names_of([Path("a/m.plan"), Path("a/m-2.plan"), Path("a/m-3.plan")])
+    'm.plan, m-2.plan, m-3.plan'
+    """
+    names = [path.name for path in paths]
+    return ", ".join(names if len(names) <= 3 else [names[0], names[1], "...", names[-1]])
+
+
 def older_files(out: Path, written: Sequence[Path]) -> list[Path]:
     """Return files that are named as if they were more sorties of this plan, or its lines."""
     if out.suffix.casefold() not in ONE_SORTIE:

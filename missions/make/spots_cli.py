@@ -26,8 +26,7 @@ from companion.cli.answer import (
 from companion.config import Config, load
 from companion.core.frame import LocalFrame
 from companion.wording import counted
-from missions.errors import PlanError
-from missions.files.write import check_suffix, write_fleet
+from missions.files.write import check_suffix, refuse_existing, remove_older, write_fleet
 from missions.make.data import in_degrees, points_of
 from missions.make.flown import (
     Boundary,
@@ -166,8 +165,8 @@ def spots(
         check_folder(path)
     if mission is not None:
         check_suffix(mission)
-        if mission.exists() and not force:
-            raise PlanError(f"{mission}: exists; another --mission, or --force to replace it")
+        if not force:
+            refuse_existing(mission, option="--mission")
     with progress(after_s=BAR_AFTER_S) as tell:
         tell("planning the passes", 0, 4)
         field = flown_field(config, no_spray or [], angle_deg, "valve")
@@ -199,6 +198,7 @@ def spots(
         files = written(map_file, out, target, config, field, problems, writer.name, force=force)
         if mission is not None:
             more, marks = write_fleet(plans[best], mission)
+            remove_older(mission, [*more, *marks])
             files = [*files, *more, *marks]
     if png is not None:
         draw_picture(map_file, png, title=out.name)

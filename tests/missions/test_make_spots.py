@@ -21,6 +21,7 @@ from pyproj import CRS, Transformer
 
 from companion.core.frame import LocalFrame
 from companion.errors import VrsprayError
+from missions.errors import PlanError
 from missions.make.spots import Budget, Part, misses, openings
 from missions.make.spots_cli import read_weeds, spots
 
@@ -219,6 +220,15 @@ def test_the_quickest_way_is_written(
     assert found["flight_s"][found["route"]] == min(found["flight_s"].values())
     # Ground without weeds is not flown.
     assert found["flight_s"][found["route"]] < 0.9 * every["flight_s"][every["route"]]
+    # The lines of another mission are no more overwritten than itself.
+    words = [
+        few / "weeds.csv", "--config", few / "config.toml", "--rate", "20",
+        "--out", tmp_path / "more.gpkg", "--mission", mission.with_suffix(".plan"),
+    ]  # fmt: skip
+    with pytest.raises(
+        PlanError, match=r"^spots\.lines\.geojson is there .* another --mission, or"
+    ):
+        typer.main.get_command(app).main([str(one) for one in words], standalone_mode=False)
 
 
 @pytest.mark.parametrize(

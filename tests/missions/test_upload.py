@@ -113,6 +113,7 @@ def test_a_wrong_plan_is_refused_with_the_place(
         ("m.kml", "", "only .plan and .waypoints"),
         ("m.plan", "{", "not a plan"),
         ("m.plan", "[" * 100_000, "too deep"),
+        ("m.plan", "\n", "m.plan: the file is empty; write it again with vrspray plan --out"),
         ("m.waypoints", "QGC WPL 120\n", "first line is not 'QGC WPL 110'"),
         ("m.waypoints", "QGC WPL 110\n", "no items"),
         ("m.waypoints", "QGC WPL 110\n0 1 0 16 0\n", "line 2: 12 columns are needed, there are 5"),
@@ -128,6 +129,18 @@ def test_a_wrong_file_is_one_line_and_exit_2(
     out, err = capsys.readouterr()
     assert says in json.loads(out)["error"]
     assert len(err.splitlines()) == 1
+
+
+def test_a_mission_and_a_device_that_are_not_there_are_refused_with_what_to_do(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    link = ["--link", f"serial:{tmp_path / 'nope'}:57600"]
+    assert execute(["upload", str(tmp_path / "none.plan"), *link]) == 2
+    assert "no such file or directory; check its name and folder" in capsys.readouterr().err
+    assert execute(["upload", str(plan_file(tmp_path)), *link]) == 2
+    refused = capsys.readouterr().err
+    assert "nope:57600: cannot be opened: there is no such device; plug it in" in refused
+    assert "CONNECTION_ERROR" not in refused
 
 
 def test_a_wrong_link_is_refused_by_name(
