@@ -429,8 +429,8 @@ def _counts(flight: AppliedFlight, evaluation: Evaluation) -> dict[str, int]:
 def _notes(flight: AppliedFlight, source: Source) -> Iterable[str]:
     """Yield what a reader of the figures has to know."""
     yield (
-        "positions are the autopilot's, flows are modelled from the executed changes: what "
-        "position, lags and flow curves are wrong by is not in these figures"
+        "positions are the autopilot's, flows are modelled from the executed changes: errors of "
+        "position, lags and flow curves are not in these figures"
     )
     if source == "meter" and flight.meter_ml is None:
         yield "there is no flow meter in the journal: the volume is the model's"

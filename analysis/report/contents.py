@@ -385,7 +385,7 @@ def _journal(flight: AppliedFlight, clock: Clock) -> Iterator[Caution]:
     if flight.lost:
         yield _warning("rows-lost", f"{flight.lost} rows of the journal are lost.")
     if not clock.is_verified:
-        yield _warning("clock", "Times are by the clock of the companion, which nobody verified.")
+        yield _warning("clock", "Times are by the clock of the companion, which was not verified.")
 
 
 def _wind(flight: AppliedFlight) -> Iterator[Caution]:
@@ -501,8 +501,8 @@ def _flow(assessment: Assessment | None, why_not: str) -> Iterator[Caution]:
         )
     if evaluation.missed:
         changes = "change" if evaluation.missed == 1 else "changes"
-        text = f"{evaluation.missed} {changes} of rate, on and off at borders included,"
-        yield _warning("missed", f"{text} never happened by what the journal holds.")
+        text = f"{evaluation.missed} {changes} of rate (on and off at borders included)"
+        yield _warning("missed", f"{text} never happened, according to the journal.")
     if evaluation.off_target_ml > 1.0:
         yield _warning("outside", f"{evaluation.off_target_ml:.1f} mL fell outside the border.")
 
