@@ -73,6 +73,10 @@ def test_ctrl_c_is_one_line_from_any_process(
     ) as process:
         time.sleep(0.6)
         wait(process.pid)
+        # First to those that read: the command would end them before they say anything.
+        for each in children(process.pid):
+            os.kill(each, signal.SIGINT)
+        time.sleep(0.3)
         os.killpg(process.pid, signal.SIGINT)
         said = "".join(process.communicate(timeout=60))
     assert process.returncode == 130, said
