@@ -16,6 +16,7 @@ from shapely import MultiPolygon
 from shapely.errors import ShapelyError
 from shapely.geometry.base import BaseGeometry
 
+from companion.core.cells import NO_RATE
 from companion.core.frame import WGS84, LocalFrame
 from companion.core.prescription import Prescription
 from companion.errors import MapError
@@ -88,6 +89,8 @@ def outline_of(
 # the outline that a headland left out of the map does not come to (28 % of 2 ha with 10 m around);
 # a share of the map that its generous border does not; a lesser share of both, as offsets make it.
 BARE_SHARE, OUTSIDE_SHARE, SHIFTED_SHARE = 0.4, 0.5, 0.05
+# So many cells tell a share to a few tenths of a percent.
+CELLS_ASKED = 50_000
 
 
 def apart_warnings(outline: BaseGeometry, prescription: Prescription) -> list[str]:
@@ -99,15 +102,13 @@ def apart_warnings(outline: BaseGeometry, prescription: Prescription) -> list[st
     >>> [line.split(":")[0] for line in apart_warnings(field, Prescription(zones))]
     ['90 % of the outline lies beyond the map, and 90 % of the map outside the outline']
     """
-    zones = np.array([zone.polygon for zone in prescription.zones], dtype=object)
-    if prescription.default_rate_l_ha is not None or not len(zones):
+    if prescription.default_rate_l_ha is not None or not prescription.rates_l_ha:
         return []
-    mapped = shapely.convex_hull(shapely.multipolygons(shapely.get_parts(zones)))
-    bare = float(shapely.area(shapely.difference(outline, mapped)) / outline.area)
     shapely.prepare(outline)
-    parted = zones[~shapely.contains_properly(outline, zones)]
-    outside_m2 = float(shapely.area(shapely.difference(parted, outline)).sum())
-    outside = outside_m2 / float(shapely.area(zones).sum())
+    mapped, outside = (_hull_of_cells if prescription.cells else _hull_of_zones)(
+        prescription, outline
+    )
+    bare = float(shapely.area(shapely.difference(outline, mapped)) / outline.area)
     if bare < BARE_SHARE and outside < OUTSIDE_SHARE and min(bare, outside) < SHIFTED_SHARE:
         return []
     bare_percent, outside_percent = (round(100.0 * share, 1) for share in (bare, outside))
@@ -116,6 +117,35 @@ def apart_warnings(outline: BaseGeometry, prescription: Prescription) -> list[st
         "map outside the outline: ground without a rate is not sprayed; if the map should cover "
         "the field, check that both are of this field, their CRS and offset_east_m"
     ]
+
+
+def _hull_of_zones(prescription: Prescription, outline: BaseGeometry) -> tuple[BaseGeometry, float]:
+    """Return the hull of all zones, and which share of them is outside of a prepared outline."""
+    zones = np.array([zone.polygon for zone in prescription.zones], dtype=object)
+    hull: BaseGeometry = shapely.GeometryCollection(zones.tolist()).convex_hull
+    parted = zones[~shapely.contains_properly(outline, zones)]
+    outside_m2 = float(shapely.area(shapely.difference(parted, outline)).sum())
+    return hull, outside_m2 / float(shapely.area(zones).sum())
+
+
+def _hull_of_cells(prescription: Prescription, outline: BaseGeometry) -> tuple[BaseGeometry, float]:
+    """Return the same of cells, by the middles of some of them: as polygons they take minutes."""
+    assert prescription.cells is not None
+    row, column = np.nonzero(prescription.cells.classes != NO_RATE)
+    to_frame = prescription.cells.to_frame
+    first = np.flatnonzero(np.diff(row, prepend=-1))
+    ends = np.append(first[1:], len(row)) - 1
+    rows, sides = row[first], (column[first], column[ends] + 1)
+    corners = [
+        np.column_stack(to_frame(side.astype(float), (rows + down).astype(float)))
+        for side in sides
+        for down in (0, 1)
+    ]
+    hull: BaseGeometry = shapely.MultiPoint(np.concatenate(corners)).convex_hull
+    some = slice(None, None, max(1, len(row) // CELLS_ASKED))
+    middles = (one[some].astype(np.float64) + 0.5 for one in (column, row))
+    inside = shapely.contains_xy(outline, *to_frame(*middles))
+    return hull, 1.0 - float(inside.mean())
 
 
 def check_degrees(area: Area, path: Path) -> None:

@@ -461,6 +461,25 @@ def test_a_map_that_is_not_of_the_field_is_warned_of(
         assert warned[0].startswith(says)
 
 
+def test_a_raster_that_is_not_of_the_field_is_warned_of(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    field = written(box(0.0, 0.0, 200.0, 100.0), tmp_path / "field.geojson")
+    west, south, east, north = to_degrees(box(100.0, 0.0, 300.0, 100.0)).bounds
+    rows = [
+        f"{south + (north - south) * (0.5 + j) / 25},{west + (east - west) * (0.5 + i) / 50},20"
+        for i in range(50)
+        for j in range(25)
+    ]
+    cells = tmp_path / "cells.csv"
+    cells.write_text("\n".join(["latitude,longitude,rate_l_ha", *rows]) + "\n")
+    _, found, _ = run(capsys, field, "--prescription", cells, "--out", tmp_path / "m.plan")
+    assert any(
+        warning.startswith("50 % of the outline lies beyond the map, and 50 % of the map")
+        for warning in found["warnings"]
+    )
+
+
 def test_choices_that_change_nothing_are_said_to_be_none(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
