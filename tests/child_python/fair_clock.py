@@ -74,8 +74,20 @@ class FairClock:
 
     def rule(self) -> None:
         """Have this process, and those that it forks, go by it, before anything asks for time."""
-        time.monotonic, time.sleep = self.now_s, self.sleep
-        time.clock_gettime = self.clock_gettime
+
+        def monotonic() -> float:
+            return self.now_s()
+
+        def sleep(for_s: float, /) -> None:
+            self.sleep(for_s)
+
+        def clock_gettime(clock: int, /) -> float:
+            return self.clock_gettime(clock)
+
+        for each in (monotonic, sleep, clock_gettime):
+            # Handed to another process, each is what that has under this name.
+            each.__module__, each.__qualname__ = "time", each.__name__
+            setattr(time, each.__name__, each)
         self.take_part()
         os.register_at_fork(after_in_child=self.take_part)
 

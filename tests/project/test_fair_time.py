@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import re
 import select
 import shutil
@@ -133,6 +134,11 @@ def test_a_clock_goes_no_further_than_it_may_and_never_back(tmp_path: Path) -> N
     assert other.now_s() == clock.now_s() == 100.02
     clock.move(100.02, computer_s(), 0.0)
     assert other.now_s() == 100.02
+
+
+def test_what_asks_for_time_can_be_handed_to_another_process() -> None:
+    for each in (time.monotonic, time.sleep, time.clock_gettime):
+        assert pickle.loads(pickle.dumps(each)) is each
 
 
 def test_sleep_is_by_the_clock(tmp_path: Path) -> None:
