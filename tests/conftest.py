@@ -49,9 +49,11 @@ _FAIR_TIME = pytest.StashKey["FairTime"]()
 
 def pytest_configure(config: pytest.Config) -> None:
     """Have the Python processes that tests start tell of what they leave open, and one clock."""
-    # Before what is tested is imported. Not in a process that has others test, and only here: this
-    # file serves projects of one test as well.
-    if config.getoption("dist", "no") == "no" and Path(__file__).with_name("fair_time.py").exists():
+    # Before what is tested is imported. Not in a process that has others test, nor beside real
+    # firmwares, which go by the computer's clock. Only here: this file serves projects of one test.
+    is_real = "not firmware" not in config.getoption("markexpr")
+    has_clock = Path(__file__).with_name("fair_time.py").exists()
+    if config.getoption("dist", "no") == "no" and has_clock and not is_real:
         from tests.fair_time import FairTime
 
         config.stash[_FAIR_TIME] = FairTime()
@@ -230,11 +232,12 @@ async def no_task_left_behind(no_thread_left_behind: None) -> AsyncIterator[None
 
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
     """Fly what flies in real time by a clock that stands while the computer holds it up."""
-    if "realtime" not in item.path.parts or item.get_closest_marker("browser") is not None:
+    found = item.config.stash.get(_FAIR_TIME, None)
+    if found is None or "realtime" not in item.path.parts or item.get_closest_marker("browser"):
         return None
     from tests import fair_time
 
-    fair_time.fly(item.config.stash[_FAIR_TIME], item, nextitem)
+    fair_time.fly(found, item, nextitem)
     return True
 
 
