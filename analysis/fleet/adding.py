@@ -12,6 +12,7 @@ import gc
 import multiprocessing
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Container, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
@@ -287,12 +288,25 @@ def _no_module_of_this_folder() -> Iterator[None]:
 
 @contextmanager
 def _interrupt_held_back() -> Iterator[None]:
-    """Start processes that Ctrl-C never reaches, from their first moment: they inherit the mask."""
+    """Start processes that Ctrl-C never reaches, from their first moment: they inherit the mask.
+
+    Here it waits for the end, whichever thread hears it: a process that is not told in full what
+    to do would end with a traceback.
+    """
+    heard: list[int] = []
+    is_main = threading.current_thread() is threading.main_thread()
+    handler = signal.getsignal(signal.SIGINT)
+    if is_main:
+        signal.signal(signal.SIGINT, lambda number, _: heard.append(number))
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+        if is_main:
+            signal.signal(signal.SIGINT, handler)
+    if heard:
+        signal.raise_signal(signal.SIGINT)
 
 
 def _started(processes: int) -> ProcessPoolExecutor:
