@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import importlib
-import json
 import os
 import signal
 import socket
@@ -30,21 +29,7 @@ from companion.output.gpio import GpioExecutor
 from companion.output.servo import ServoExecutor
 from companion.output.timed import DryRunExecutor
 from tests.companion.wire_peer import free_port, heard
-
-FOLDER = Path(__file__).resolve().parents[2] / "examples" / "anyang"
-CONFIG = str(FOLDER / "config.toml")
-MAP = str(FOLDER / "prescription.shp")
-
-Captured = pytest.CaptureFixture[str]
-
-
-def run_json(capsys: Captured, *arguments: str) -> tuple[int, dict[str, Any]]:
-    """Run with --json and insist on exactly one object on stdout."""
-    code = execute([*arguments, "--json"])
-    found = json.loads(capsys.readouterr().out)
-    assert isinstance(found, dict)
-    return code, found
-
+from tests.json_answers import CONFIG, MAP, Captured, run_json
 
 # ------------------------------------------------------------------------------- the program itself
 

@@ -4,25 +4,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from companion.cli.app import execute
-
-FOLDER = Path(__file__).resolve().parents[2] / "examples" / "anyang"
-CONFIG = str(FOLDER / "config.toml")
-MAP = str(FOLDER / "prescription.shp")
-
-Captured = pytest.CaptureFixture[str]
-
-
-def run_json(capsys: Captured, *arguments: str) -> tuple[int, dict[str, Any]]:
-    """Run with --json and insist on exactly one object on stdout."""
-    code = execute([*arguments, "--json"])
-    found = json.loads(capsys.readouterr().out)
-    assert isinstance(found, dict)
-    return code, found
+from tests.json_answers import CONFIG, MAP, Captured, run_json
 
 
 def test_map_check_has_the_promised_keys(capsys: Captured) -> None:
