@@ -25,7 +25,7 @@ COMPILE = $(BIN)/uv pip compile --universal --fork-strategy fewest --python-vers
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-computing test-flights test-companion test-missions test-analysis test-sitl lint format-check ruff mypy imports bench mutants mutants-safety faults test-gpio test-firmware arm-wheels test-image test-wheel wheel docs reference lock clean bench-missions
+.PHONY: help setup demo test test-computing test-flights test-companion test-missions test-analysis test-sitl lint format-check ruff mypy imports weight bench mutants mutants-safety faults test-gpio test-firmware arm-wheels test-image test-wheel wheel docs reference lock clean bench-missions
 
 help: ## what there is
 	@awk -F ':.*## ' '/^[a-z -]+:.*## /{printf "make %-15s %s\n", $$1, $$2}' Makefile
@@ -58,7 +58,7 @@ test-companion test-missions test-analysis test-sitl: export PYTHONDONTWRITEBYTE
 test-companion test-missions test-analysis test-sitl: test-%: $(INSTALLED)
 	$(STRICT) $(BIN)/pytest --numprocesses $(WORKERS) $(BY_FILE) --ignore tests/$*/realtime $(ARGS) $* tests/$* $(ALSO)
 
-lint: format-check ruff mypy imports ## format, ruff, mypy, import rules
+lint: format-check ruff mypy imports weight ## format, ruff, mypy, import rules, weight
 
 format-check: $(INSTALLED)
 	$(BIN)/ruff format --check .
@@ -73,6 +73,9 @@ imports: $(INSTALLED)
 	$(BIN)/lint-imports
 	$(BIN)/python -m tests.import_circles
 	$(BIN)/python -m tests.house
+
+weight: $(INSTALLED)
+	$(BIN)/python -m tools.size --check
 
 bench: $(INSTALLED) ## the figures that README gives (SEED=N for another draw)
 	$(BIN)/python -m tests.bench $(SEED)

@@ -1,11 +1,10 @@
 """Check the rules that keep the house easy to walk through: `python -m tests.house`.
 
-A part of `make imports`. A module has two importers or a door of its own: a command, a name that
-others load by, or an import inside a function (it is loaded only when it is asked for). One with a
-single importer belongs into it, unless the two together pass 600 lines. What is an exception has
-its reason here. No module has more than 600 lines, and no function says more than 60: from its
-first statement to its end, without signature (a command's declares its options) and docstring.
-A name that begins with `_` is its module's own: no other imports it (ruff sees `module._name`).
+A part of `make imports`. Somebody imports each module, or loads it by its name: a command, an
+entry point, `python -m`. No function says more than 60 lines: from its first statement to its end,
+without signature (a command's declares its options) and docstring; what is an exception has its
+reason here. A name that begins with `_` is its module's own: no other imports it (ruff sees
+`module._name`). How much code a package may hold is in `weight.toml`.
 """
 
 from __future__ import annotations
@@ -20,14 +19,6 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("companion", "missions", "sitl", "analysis")
-LINES_MAX = 600
-# A module that has one importer and stays a file of its own, and why.
-EXCEPTIONS: dict[str, str] = {
-    "analysis.journals.salvage": "what is done to a journal, apart from the command line",
-    "analysis.journals.stray_rows": "what a page may be of; pure, apart from the copy it serves",
-}
-# Longer than 600 lines, to be cut; nothing is added here.
-TOO_LONG: tuple[str, ...] = ()
 FUNCTION_LINES_MAX = 60
 # A function that says more and stays one, and why.
 LONG_FUNCTIONS: dict[str, str] = {
@@ -48,24 +39,14 @@ def modules(root: Path = ROOT) -> dict[str, Path]:
     return found
 
 
-def importers(files: dict[str, Path]) -> tuple[dict[str, set[str]], set[str]]:
-    """Return who imports each module, and the modules that a function imports when it runs."""
+def importers(files: dict[str, Path]) -> dict[str, set[str]]:
+    """Return who imports each module, wherever in it."""
     by: dict[str, set[str]] = defaultdict(set)
-    asked_for: set[str] = set()
     for name, path in files.items():
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        in_functions = {
-            id(inner)
-            for node in ast.walk(tree)
-            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-            for inner in ast.walk(node)
-        }
-        for node in ast.walk(tree):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             for target in _targets(node, files):
                 by[target].add(name)
-                if id(node) in in_functions:
-                    asked_for.add(target)
-    return by, asked_for
+    return by
 
 
 def _targets(node: ast.AST, files: dict[str, Path]) -> list[str]:
@@ -170,32 +151,16 @@ def _is_private(name: str) -> bool:
 def findings(root: Path = ROOT) -> list[str]:
     """Return what breaks a rule, one line each."""
     files = modules(root)
-    by, asked_for = importers(files)
-    doors = named(root, files)
-    size = {
-        name: len(path.read_text(encoding="utf-8").splitlines()) for name, path in files.items()
-    }
-    found: list[str] = []
-    alone: dict[str, str] = {}
-    for name, path in files.items():
-        if size[name] > LINES_MAX and name not in TOO_LONG:
-            found.append(f"{name}: {size[name]} lines, more than {LINES_MAX}")
-        users = by[name] - {name}
-        # What a package exports, and what `python -m` starts, are doors too.
-        is_exported = any(files[user].name in ("__init__.py", "__main__.py") for user in users)
-        is_door = name in doors or name in asked_for or path.name in ("__init__.py", "__main__.py")
-        is_study = name.startswith("sitl.studies.")  # run by themselves: python -m ...
-        if len(users) > 1 or is_study or is_exported or is_door:
-            continue
-        if not users:
-            alone[name] = f"{name}: nobody imports it"
-        elif size[name] + size[next(iter(users))] <= LINES_MAX:
-            alone[name] = f"{name}: only {next(iter(users))} imports it: fold it into that"
-    found += [line for name, line in alone.items() if name not in EXCEPTIONS]
-    found += [
-        f"{name}: an exception that nothing needs" for name in EXCEPTIONS if name not in alone
+    by, doors = importers(files), named(root, files)
+    unused = [
+        f"{name}: nobody imports it"
+        for name, path in files.items()
+        if not by[name] - {name}
+        and name not in doors
+        and path.name not in ("__init__.py", "__main__.py")
+        and not name.startswith("sitl.studies.")  # run by themselves: python -m ...
     ]
-    return found + private_imports(files) + long_functions(files)
+    return unused + private_imports(files) + long_functions(files)
 
 
 def main() -> int:
@@ -204,7 +169,7 @@ def main() -> int:
     for line in found:
         sys.stdout.write(line + "\n")
     files = modules()
-    exceptions = len(EXCEPTIONS) + len(LONG_FUNCTIONS)
+    exceptions = len(LONG_FUNCTIONS)
     sys.stdout.write(f"{len(files)} modules, {len(found)} findings, {exceptions} exceptions\n")
     return 1 if found else 0
 

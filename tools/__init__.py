@@ -1,0 +1,1 @@
+"""What measures, generates and checks the project; nothing of it is installed."""
