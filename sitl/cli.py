@@ -170,8 +170,19 @@ def serve(
 
 @app.command()
 def fly(
-    config: Annotated[Path, typer.Option(help="Configuration of the companion.")],
-    mission: Annotated[Path, typer.Option(help="Mission, .plan or .waypoints.")],
+    config: Annotated[
+        Path | None, typer.Option(help="Configuration of the companion; with --along: the example.")
+    ] = None,
+    mission: Annotated[Path | None, typer.Option(help="Mission, .plan or .waypoints.")] = None,
+    along: Annotated[
+        Path | None,
+        typer.Option(metavar="LOG", help="In place of a mission: a flight really flown (.BIN)."),
+    ] = None,
+    position_rate_hz: Annotated[
+        float | None,
+        typer.Option(help="With --along: states told a second; default: the configuration's."),
+    ] = None,
+    flights: Annotated[int, typer.Option(help="With --along: how many, each on its own map.")] = 3,
     scenario: Annotated[Path | None, typer.Option(help="Scenario: timed faults (TOML).")] = None,
     plant: Annotated[
         str | None,
@@ -208,7 +219,7 @@ def fly(
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
 ) -> None:
-    """Simulate a mission in closed loop, and evaluate it.
+    """Simulate a mission in closed loop, and evaluate it; or fly along a log of your own.
 
     Faster than real time.
 
@@ -216,6 +227,21 @@ def fly(
     examples/anyang/mission.waypoints
     """
     from companion.cli.answer import answer, note
+    from companion.errors import ConfigError
+
+    if along is not None:
+        from sitl.along import AlongOptions, along_lines, fly_along
+
+        result = fly_along(
+            AlongOptions(
+                log=along, config=config, plant=plant, position_rate_hz=position_rate_hz,
+                seed=seed, flights=flights, out=out,
+            ),
+            note,
+        )  # fmt: skip
+        return answer(result, along_lines(result), as_json=json)
+    if config is None or mission is None:
+        raise ConfigError("give --config and --mission, or --along LOG")
     from sitl.fly import FlyOptions, fly_mission
     from sitl.fly_files import fly_lines, write_files
 
@@ -238,7 +264,7 @@ def fly(
     result = flown.as_json()
     if out is not None:
         result["out"] = [str(path) for path in write_files(flown, out, note)]
-    answer(result, fly_lines(result), as_json=json)
+    return answer(result, fly_lines(result), as_json=json)
 
 
 def _run(options: Any) -> dict[str, Any]:

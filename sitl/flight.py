@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Literal
@@ -139,22 +139,28 @@ def fly(
     mission: Route | None = None,
     on_step: OnStep | None = None,
     own: MakeController | None = None,
+    heard: Iterable[Input] | None = None,
+    plans: Iterable[SprayPlan] | None = None,
 ) -> FlightResult:
     """Fly `trajectory` with our controller, with P1's where `wang` is given, or with one's `own`.
 
     With `mission`, the route that the trajectory flies, the controller hears which leg it is.
+    `heard` is all that it hears, in place of what a simulated autopilot would tell; `plans` are of
+    whoever needs to hear nothing.
     `on_step` gets what each step has left, the state that it was given, and its time.
     """
     profile = true_profile(profile, options)
     start_s, end_s = float(trajectory.time_s[0]), float(trajectory.time_s[-1])
     plant, output = sprayer(profile, options, start_s)
-    inputs = _inputs(setup, trajectory, options)
+    inputs = _inputs(setup, trajectory, options) if heard is None else iter(heard)
     if mission is not None:
         said_legs = leg_reports(mission, trajectory, setup.frame)
         inputs = heapq.merge(inputs, said_legs, key=lambda item: item.received_s)
     if disturb is not None:
         inputs = disturb(inputs)
-    if own is not None:
+    if plans is not None:
+        said = _follow(plans, output)
+    elif own is not None:
         said = _fly_own(own, method or own.__name__, setup, inputs, output, start_s)
     elif wang is not None:
         said = _fly_wang(wang, inputs, output, start_s)
@@ -367,6 +373,14 @@ class _Said:
     late: int = 0
     unresolved: int = 0
     coverage: Coverage | None = None
+
+
+def _follow(plans: Iterable[SprayPlan], output: Output) -> _Said:
+    """Carry out plans that were made beforehand."""
+    said = _Said(set())
+    for plan in plans:
+        output.submit(plan, now_s=plan.issued_s)
+    return said
 
 
 def _fly_ours(

@@ -38,6 +38,11 @@ class Trajectory:
     leg: NDArray[np.int64]
     height_m: float
 
+    @property
+    def speed_m_s(self) -> Floats:
+        """Return the speed over the ground."""
+        return np.hypot(self.velocity_east_m_s, self.velocity_north_m_s)
+
     def at(self, time_s: Floats) -> Trajectory:
         """Return the flight at other times, interpolated; held at its ends."""
         nearest = np.clip(np.searchsorted(self.time_s, time_s), 0, len(self.time_s) - 1)
