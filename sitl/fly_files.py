@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +19,7 @@ from sitl.deposit import Deposit
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from analysis.flight_record import FlightRecord
     from sitl.fly import Flown
 
 RASTER_CELLS_MAX = 4_000_000
@@ -40,13 +41,8 @@ def write_files(flown: Flown, folder: Path, say: Callable[[str], None]) -> list[
     # A journal is the record of the companion's own decisions, which replay makes again.
     if flown.task.own is None:
         files.append(write_journal(flown, folder))
-    picture = folder / "flight.png"
-    try:
-        _draw(flown, picture)
-        files.append(picture)
-    except ImportError:
-        say(f"no picture: matplotlib is missing; {install_command('office')}")
-    return files
+    record = flown.result.record
+    return files + draw({record.meta.method: record}, folder / "flight.png", say)
 
 
 def truth_arrays(flown: Flown) -> dict[str, Any]:
@@ -146,26 +142,32 @@ def _number(value: float | None, digits: int = 3) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def _draw(flown: Flown, path: Path) -> None:
-    """Draw the prescription, what was applied, and the flow over the time."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
+def draw(records: Mapping[str, FlightRecord], path: Path, say: Callable[[str], None]) -> list[Path]:
+    """Draw the first record's map, what was applied, and the flow of all; return the picture."""
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        say(f"no picture: matplotlib is missing; {install_command('office')}")
+        return []
+    record = next(iter(records.values()))
     figure = Figure(figsize=(12, 9), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplot_mosaic([["asked", "applied"], ["flow", "flow"]], height_ratios=[3, 1])
-    rates = flown.task.setup.prescription.rates_l_ha
-    most = max(rates) or 1.0
-    _draw_asked(flown, axes["asked"], most)
-    image = _draw_applied(flown, axes["applied"], most)
+    most = max(record.prescription.rates_l_ha) or 1.0
+    _draw_asked(record, axes["asked"], most)
+    image = _draw_applied(record, axes["applied"], most)
     figure.colorbar(image, ax=axes["applied"], label="L/ha")
-    _draw_flow(flown, axes["flow"])
+    for name, each in records.items():
+        _draw_flow(each, axes["flow"], name)
+    if len(records) > 1:
+        axes["flow"].legend(loc="upper right")
     figure.savefig(path, dpi=110)
+    return [path]
 
 
-def _window(flown: Flown) -> tuple[float, float, float, float]:
+def _window(record: FlightRecord) -> tuple[float, float, float, float]:
     """Return west, south, east, north of the flight and what its boom reaches."""
-    record = flown.result.record
     reach_m = record.boom.reach_m + MARGIN_M
     return (
         float(record.east_m.min()) - reach_m,
@@ -175,14 +177,14 @@ def _window(flown: Flown) -> tuple[float, float, float, float]:
     )
 
 
-def _draw_asked(flown: Flown, axes: Axes, most_l_ha: float) -> None:
+def _draw_asked(record: FlightRecord, axes: Axes, most_l_ha: float) -> None:
     import shapely
     from matplotlib import colormaps
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path as Outline
 
-    window = shapely.box(*_window(flown))
-    for zone in flown.task.setup.prescription.zones:
+    window = shapely.box(*_window(record))
+    for zone in record.prescription.zones:
         for part in shapely.get_parts(zone.polygon.intersection(window)):
             if not isinstance(part, shapely.Polygon):
                 continue
@@ -192,16 +194,14 @@ def _draw_asked(flown: Flown, axes: Axes, most_l_ha: float) -> None:
             )
             colour = colormaps["viridis_r"](zone.rate_l_ha / most_l_ha)
             axes.add_patch(PathPatch(outline, facecolor=colour, edgecolor="white", linewidth=0.3))
-    record = flown.result.record
     axes.plot(record.east_m, record.north_m, color="tab:red", linewidth=0.7)
-    _frame(axes, flown, "prescribed, and the way flown")
+    _frame(axes, record, "prescribed, and the way flown")
 
 
-def _draw_applied(flown: Flown, axes: Axes, most_l_ha: float) -> Any:
-    west_m, south_m, east_m, north_m = _window(flown)
+def _draw_applied(record: FlightRecord, axes: Axes, most_l_ha: float) -> Any:
+    west_m, south_m, east_m, north_m = _window(record)
     area_m2 = (east_m - west_m) * (north_m - south_m)
     cell_m = max(0.25, float(np.sqrt(area_m2 / RASTER_CELLS_MAX)))
-    record = flown.result.record
     deposit = Deposit((west_m, south_m, east_m, north_m), cell_m=cell_m)
     deposit.add(
         east_m=record.east_m,
@@ -225,23 +225,22 @@ def _draw_applied(flown: Flown, axes: Axes, most_l_ha: float) -> Any:
         vmax=most_l_ha,
         cmap="viridis_r",
     )
-    _frame(axes, flown, "applied")
+    _frame(axes, record, "applied")
     return image
 
 
-def _draw_flow(flown: Flown, axes: Axes) -> None:
-    record = flown.result.record
+def _draw_flow(record: FlightRecord, axes: Axes, name: str) -> None:
     period = max(round(record.pwm_period_s / record.step_s), 1)
     volume_ml = record.volume_ml.sum(axis=1)[::period]
     time_s = record.time_s[::period]
     flow_l_min = np.diff(volume_ml) / np.diff(time_s) * 0.06
-    axes.plot(0.5 * (time_s[1:] + time_s[:-1]), flow_l_min, linewidth=0.7)
+    axes.plot(0.5 * (time_s[1:] + time_s[:-1]), flow_l_min, linewidth=0.7, label=name)
     axes.set_xlabel("time [s]")
     axes.set_ylabel("flow [L/min]")
 
 
-def _frame(axes: Axes, flown: Flown, title: str) -> None:
-    west_m, south_m, east_m, north_m = _window(flown)
+def _frame(axes: Axes, record: FlightRecord, title: str) -> None:
+    west_m, south_m, east_m, north_m = _window(record)
     axes.set_xlim(west_m, east_m)
     axes.set_ylim(south_m, north_m)
     axes.set_aspect("equal")

@@ -1,278 +1,297 @@
 """A flight that was really flown, as its log has it: what the autopilot told, and when.
 
-Of ArduPilot's dataflash logs: the place is POS, which is what GLOBAL_POSITION_INT tells; velocity
-is that of the EKF's core that flew (XKF4.PI); the nose is ATT's. Stamps, rounding and gaps stay.
+ArduPilot's dataflash: the place is POS, which is what GLOBAL_POSITION_INT tells; velocity is that
+of the EKF's core that flew (XKF4.PI); the nose is ATT's. Telemetry logs hold the messages
+themselves, PX4's ULog the topics that they are made of. Stamps and gaps stay as they are.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable
+from bisect import bisect_right
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from companion.errors import ConfigError
+from companion.flight_modes import COPTER
+from companion.wording import install_command
+from sitl.earth import Earth
+from sitl.stub.protocol import AUTOPILOT_COMPONENT, Listener, sender
 
 Floats = NDArray[np.float64]
+Held = list[tuple[float, Any]]
 
-# Two rows of one loop of the autopilot are this near; a log that pauses for longer is two flights.
-TOGETHER_S, PAUSE_S = 0.06, 1.0
-# What is slower does not fly anywhere; so much is told before it moves and after it stands.
-MOVING_M_S, BEFORE_S, AFTER_S = 1.0, 5.0, 3.0
-LEAST_S = 5.0
-
-
-_COLUMNS = (
-    "time_s", "latitude_deg", "longitude_deg", "height_m", "velocity_north_m_s",
-    "velocity_east_m_s", "velocity_down_m_s", "heading_deg",
+COLUMNS = (
+    "time_s", "latitude_deg", "longitude_deg", "height_m", "north_m_s", "east_m_s", "down_m_s",
+    "heading_deg",
 )  # fmt: skip
+# A log that pauses for longer is two flights. What is slower flies nowhere; so much is told before
+# it moves and after it stands.
+PAUSE_S, MOVING_M_S, BEFORE_S, AFTER_S, LEAST_S = 1.0, 1.0, 5.0, 3.0, 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recorded:
-    """What was told along a flight, a row a state; velocities are [m/s], the heading [deg].
+    """What was told along a flight: `states` have `COLUMNS`, a row a state.
 
     `modes`, `armed` and `fixes` are (time, value), from which on they hold; a fix is as MAVLink
-    numbers it. `receiver` are time, latitude, longitude and speed of the receiver's own solutions.
+    numbers it. `receiver` are the receiver's own time, latitude, longitude.
     """
 
     name: str
-    time_s: Floats
-    latitude_deg: Floats
-    longitude_deg: Floats
-    height_m: Floats
-    velocity_north_m_s: Floats
-    velocity_east_m_s: Floats
-    velocity_down_m_s: Floats
-    heading_deg: Floats
-    modes: tuple[tuple[float, str], ...]
-    armed: tuple[tuple[float, bool], ...]
-    fixes: tuple[tuple[float, int], ...]
+    states: Any
+    modes: Held = field(default_factory=list)
+    armed: Held = field(default_factory=list)
+    fixes: Held = field(default_factory=list)
     receiver: Floats
     notes: tuple[str, ...] = ()
 
     @property
     def speed_m_s(self) -> Floats:
         """Return the speed over the ground."""
-        return np.hypot(self.velocity_east_m_s, self.velocity_north_m_s)
+        found: Floats = np.hypot(self.states.east_m_s, self.states.north_m_s)
+        return found
 
     @property
     def rate_hz(self) -> float:
         """Return how often a state was recorded."""
-        return float(1.0 / np.median(np.diff(self.time_s)))
-
-    def between(self, begin_s: float, end_s: float) -> Recorded:
-        """Return the rows from a time until another."""
-        which = np.flatnonzero((self.time_s >= begin_s) & (self.time_s <= end_s))
-        return self._rows(which)
-
-    def _rows(self, which: NDArray[np.int64]) -> Recorded:
-        return replace(self, **{name: getattr(self, name)[which] for name in _COLUMNS})
-
-    def at_rate(self, rate_hz: float) -> Recorded:
-        """Return the states at another rate: rows left out, or put between two.
-
-        What lies between two rows is made with the later one: it knows the future.
-        """
-        if rate_hz <= 1.05 * self.rate_hz:
-            ticks = np.floor((self.time_s - self.time_s[0]) * rate_hz + 0.25)
-            return self._rows(np.flatnonzero(np.diff(ticks, prepend=-1.0) > 0.0))
-        parts = max(round(rate_hz / self.rate_hz), 1)
-        gaps = np.diff(self.time_s)
-        # Nothing is put into a gap.
-        counts = np.where(gaps < 1.5 / self.rate_hz, parts, 1)
-        within = [np.arange(count) / count for count in counts]
-        at_s = np.concatenate([*(t + g * w for t, g, w in zip(self.time_s, gaps, within)), []])  # noqa: B905
-        at_s = np.append(at_s, self.time_s[-1])
-        return self._interpolated(at_s)
-
-    def _interpolated(self, at_s: Floats) -> Recorded:
-        place = {
-            name: np.interp(at_s, self.time_s, getattr(self, name))
-            for name in ("height_m", "velocity_north_m_s", "velocity_east_m_s", "velocity_down_m_s")
-        }
-        turn = np.unwrap(self.heading_deg, period=360.0)
-        place["heading_deg"] = np.interp(at_s, self.time_s, turn) % 360.0
-        metres = math.radians(6_371_000.0)
-        lon_m = metres * math.cos(math.radians(float(self.latitude_deg[0])))
-        for name, per_deg, speed in (
-            ("latitude_deg", metres, self.velocity_north_m_s),
-            ("longitude_deg", lon_m, self.velocity_east_m_s),
-        ):
-            place[name] = np.round(
-                cubic(at_s, self.time_s, getattr(self, name), speed / per_deg), 7
-            )
-        return replace(self, time_s=at_s, **place)
+        return float(1.0 / np.median(np.diff(self.states.time_s)))
 
 
-def cubic(at_s: Floats, time_s: Floats, value: Floats, slope: Floats) -> Floats:
-    """Return values between others by those and their slopes.
+def held(told: Held, now_s: float, default: Any) -> Any:
+    """Return what holds at a time, of what was told in order of time.
 
-    >>> cubic(np.array([0.5]), np.array([0.0, 1.0]), np.array([0.0, 1.0]), np.ones(2)).tolist()
-    [0.5]
+    >>> held([(1.0, "AUTO"), (2.0, "LAND")], 1.5, "UNKNOWN"), held([], 1.5, "UNKNOWN")
+    ('AUTO', 'UNKNOWN')
     """
-    i = np.clip(np.searchsorted(time_s, at_s, side="right") - 1, 0, len(time_s) - 2)
-    span = time_s[i + 1] - time_s[i]
-    u = (at_s - time_s[i]) / span
-    rise = value[i + 1] - value[i]
-    a, b = slope[i] * span - rise, rise - slope[i + 1] * span
-    found: Floats = value[i] + u * rise + u * (1.0 - u) * (a * (1.0 - u) + b * u)
-    return found
+    number = bisect_right(told, now_s, key=itemgetter(0))
+    return told[number - 1][1] if number else default
 
 
-def read_flight(path: Path) -> Recorded:
-    """Return the longest flight of a log.
+def rows_of(columns: Iterable[Floats]) -> Any:
+    """Return columns as states."""
+    return np.rec.fromarrays(list(columns), dtype=[(name, "f8") for name in COLUMNS])
+
+
+def table_of(columns: Iterable[Floats]) -> Any:
+    """Return states in order of time, each time once, without those of no place."""
+    table = np.array(list(columns), dtype=np.float64)
+    table = table[:, np.isfinite(table).all(axis=0) & table[1:3].any(axis=0)]
+    _, first = np.unique(table[0], return_index=True)
+    return rows_of(table[:, first])
+
+
+def read_flight(path: Path, allows: Callable[[str], bool] = bool) -> Recorded:
+    """Return the longest flight of a log in modes that are allowed, or else in any.
 
     Raises:
         ConfigError: it cannot be read, or holds no flight; in one line.
     """
-    rows = _dataflash(path)
-    return _longest(_recorded(path, rows))
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise ConfigError(f"{path}: give a log as {', '.join(_READERS)}")
+    try:
+        flight = reader(path)
+        return _longest(flight, allows) or _longest(flight, bool) or _refuse(path)
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}; give a log") from error
+    except (ValueError, LookupError, AttributeError, TypeError) as error:
+        raise ConfigError(
+            f"{path}: no {path.suffix} of a flight ({error!r}); it takes place, speed and heading"
+        ) from error
 
 
-Rows = dict[str, list[Any]]
-_KINDS = ("POS", "XKF1", "XKF4", "NKF1", "NKF4", "EKF1", "ATT", "GPS", "MODE", "ARM", "EV")
+def _refuse(path: Path) -> NoReturn:
+    raise ConfigError(f"{path}: no flight: armed, nothing moves in it for {LEAST_S:g} s")
+
+
+def _longest(flight: Recorded, allows: Callable[[str], bool]) -> Recorded | None:
+    """Return the longest stretch of moving flight, armed, in such modes, and without a pause."""
+    flown = [
+        # A log begins with the arming: of that itself it may say nothing.
+        held(flight.armed, at_s, default=True) and allows(held(flight.modes, at_s, "UNKNOWN"))
+        for at_s in flight.states.time_s.tolist()
+    ]
+    states, found = flight.states[np.array(flown, dtype=np.bool_)], []
+    if not len(states):
+        return None
+    gaps_s = np.diff(states.time_s)
+    pauses = gaps_s > max(PAUSE_S, 3.0 * float(np.median(gaps_s)))
+    stretches: list[Any] = np.split(states, np.flatnonzero(pauses) + 1)
+    for rows in stretches:
+        moving = rows.time_s[np.hypot(rows.east_m_s, rows.north_m_s) > MOVING_M_S]
+        if len(moving):
+            first_s, last_s = moving[0] - BEFORE_S, moving[-1] + AFTER_S
+            found.append(rows[(rows.time_s >= first_s) & (rows.time_s <= last_s)])
+    rows = max(found, key=lambda each: np.ptp(each.time_s), default=states[:1])
+    if not np.ptp(rows.time_s) >= LEAST_S:
+        return None
+    notes, gaps_s = [], np.diff(rows.time_s)
+    missing = int((gaps_s > 1.5 * np.median(gaps_s)).sum())
+    if len(found) > 1:
+        notes.append(f"{len(found)} stretches of flight in the log: the longest is flown")
+    if missing:
+        notes.append(f"{missing} gaps between states, of up to {gaps_s.max():.2f} s: as they are")
+    return replace(flight, states=rows, notes=tuple(notes))
+
+
+def _columns(rows: Iterable[Any], *names: str) -> Floats:
+    """Return times and values of rows, a row a name."""
+    found = [[getattr(row, name) for name in ("TimeUS", *names)] for row in rows]
+    table = np.array(found, dtype=np.float64).reshape(-1, len(names) + 1).T
+    table[0] *= 1e-6
+    return table
+
+
+def _at(time_s: Floats, table: Floats) -> Iterator[Floats]:
+    """Yield the values of rows at other times."""
+    for values in table[1:]:
+        yield np.interp(time_s, table[0], values)
+
+
+def _turn(degrees: Floats) -> Floats:
+    return np.unwrap(degrees, period=360.0)
+
+
+# ------------------------------------------------------------------------------------ dataflash
+
+_KINDS = ["POS", "XKF1", "XKF4", "NKF1", "NKF4", "ATT", "GPS", "MODE", "ARM", "EV"]
 # EV.Id of arming and disarming, for logs without ARM.
 _EV_ARMED = {10: True, 11: False}
 
 
-def _dataflash(path: Path) -> Rows:
+def _dataflash(path: Path) -> Recorded:
     from pymavlink import DFReader
 
-    rows: Rows = {kind: [] for kind in _KINDS}
-    try:
-        if path.stat().st_size < 1024:
-            raise ConfigError(f"{path}: too short for a log of a flight")
-        log = DFReader.DFReader_binary(str(path))
-        with closing(log.filehandle), closing(log.data_map):
-            while (row := log.recv_match(type=list(_KINDS))) is not None:
-                rows[row.get_type()].append(row)
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror or error}; give a log") from error
-    except (ValueError, IndexError, KeyError, AttributeError, TypeError) as error:
-        raise ConfigError(f"{path}: no dataflash log ({error!r}); give a .BIN") from error
-    return rows
-
-
-def _recorded(path: Path, rows: Rows) -> Recorded:
-    kind = next((each for each in ("XKF1", "NKF1", "EKF1") if rows[each]), None)
-    if kind is None or not rows["POS"] or not rows["ATT"]:
-        raise ConfigError(
-            f"{path}: no POS, ATT and XKF1 in it; log with LOG_BITMASK as ArduPilot has it"
-        )
-    flown = _table(rows["POS"], "Lat", "Lng", "RelHomeAlt")
-    core = _core_that_flew(rows, kind)
-    nose = _table(rows["ATT"], "Yaw")
-    _, first = np.unique(flown[:, 0], return_index=True)
-    flown = flown[first]
-    near_core, near_nose = _nearest(flown[:, 0], core[:, 0]), _nearest(flown[:, 0], nose[:, 0])
-    apart_s = np.maximum(
-        np.abs(core[near_core, 0] - flown[:, 0]), np.abs(nose[near_nose, 0] - flown[:, 0])
-    )
-    keep = apart_s < TOGETHER_S
-    time_s, latitude, longitude, height = flown[keep].T
-    north, east, down = core[near_core[keep], 1:4].T
+    rows: dict[str, list[Any]] = {kind: [] for kind in _KINDS}
+    log = DFReader.DFReader_binary(str(path))
+    with closing(log.filehandle), closing(log.data_map):
+        while (row := log.recv_match(type=_KINDS)) is not None:
+            rows[row.get_type()].append(row)
+    place = _columns(rows["POS"], "Lat", "Lng", "RelHomeAlt")
+    nose = _columns(rows["ATT"], "Yaw")
+    nose[1] = _turn(nose[1])
+    moves = _flown(rows["XKF1"] or rows["NKF1"], rows["XKF4"] or rows["NKF4"])
+    gps = [row for row in rows["GPS"] if not getattr(row, "I", 0)]
+    armed = [(row.TimeUS * 1e-6, _EV_ARMED[row.Id]) for row in rows["EV"] if row.Id in _EV_ARMED]
+    armed += [(row.TimeUS * 1e-6, bool(row.ArmState)) for row in rows["ARM"]]
     return Recorded(
         name=path.name,
-        time_s=time_s,
-        latitude_deg=np.round(latitude, 7),
-        longitude_deg=np.round(longitude, 7),
-        height_m=height,
-        velocity_north_m_s=north,
-        velocity_east_m_s=east,
-        velocity_down_m_s=down,
-        heading_deg=nose[near_nose[keep], 1] % 360.0,
-        modes=_modes(rows["MODE"]),
-        armed=_armed(rows),
-        fixes=tuple((_time(row), int(row.Status)) for row in rows["GPS"] if _instance(row) == 0),
-        receiver=_table([r for r in rows["GPS"] if _instance(r) == 0], "Lat", "Lng", "Spd"),
+        states=table_of([*place, *_at(place[0], moves), *_at(place[0], nose)]),
+        modes=[(row.TimeUS * 1e-6, _copter(row.ModeNum)) for row in rows["MODE"]],
+        armed=sorted(armed),
+        fixes=[(row.TimeUS * 1e-6, row.Status) for row in gps],
+        receiver=_columns(gps, "Lat", "Lng"),
     )
 
 
-def _time(row: Any) -> float:
-    return float(row.TimeUS) * 1e-6
+def _flown(states: list[Any], cores: list[Any]) -> Floats:
+    """Return time and velocity north, east, down of the core that is used at each time."""
+    used = _columns([row for row in cores if hasattr(row, "PI")], "PI")
+    if not used.size:
+        return _columns([row for row in states if not getattr(row, "C", 0)], "VN", "VE", "VD")
+    table = _columns(states, "VN", "VE", "VD", "C")
+    now = used[1][np.searchsorted(used[0], table[0], side="right").clip(1) - 1]
+    return table[:4, table[4] == now]
 
 
-def _instance(row: Any) -> int:
-    return int(getattr(row, "I", 0))
+def _copter(number: int) -> str:
+    return COPTER.get(int(number), f"MODE {number}")
 
 
-def _table(rows: Iterable[Any], *names: str) -> Floats:
-    found = [(_time(row), *(float(getattr(row, name)) for name in names)) for row in rows]
-    table = np.array(found, dtype=np.float64).reshape(-1, len(names) + 1)
-    good = table[np.isfinite(table).all(axis=1)]
-    return good[np.argsort(good[:, 0], kind="stable")]
+# ------------------------------------------------------------------------------------ telemetry
 
 
-def _core_that_flew(rows: Rows, kind: str) -> Floats:
-    """Return time and velocity north, east, down of the core in use at each time."""
-    table = _table(rows[kind], "VN", "VE", "VD")
-    cores = np.array([int(getattr(row, "C", 0)) for row in rows[kind]])
-    if len(cores) != len(table):
-        cores = np.zeros(len(table), dtype=np.int64)
-    used = [(_time(row), int(row.PI)) for row in rows[kind[:3] + "4"] if hasattr(row, "PI")]
-    if not used:
-        first: Floats = table[cores == cores.min(initial=0)]
-        return first
-    at_s, primary = (np.array(each) for each in zip(*used, strict=True))
-    now = primary[np.clip(np.searchsorted(at_s, table[:, 0], side="right") - 1, 0, None)]
-    flew: Floats = table[cores == now]
-    return flew
-
-
-def _nearest(at_s: Floats, among_s: Floats) -> NDArray[np.int64]:
-    after = np.clip(np.searchsorted(among_s, at_s), 1, len(among_s) - 1)
-    before_is_nearer = at_s - among_s[after - 1] < among_s[after] - at_s
-    found: NDArray[np.int64] = after - before_is_nearer
-    return found
-
-
-def _modes(rows: Iterable[Any]) -> tuple[tuple[float, str], ...]:
-    from pymavlink import mavutil
-
-    names = mavutil.mode_mapping_acm
-    return tuple(
-        (_time(row), str(names.get(int(row.ModeNum), f"MODE_{int(row.ModeNum)}"))) for row in rows
-    )
-
-
-def _armed(rows: Rows) -> tuple[tuple[float, bool], ...]:
-    told = [(_time(row), _EV_ARMED[row.Id]) for row in rows["EV"] if row.Id in _EV_ARMED]
-    told += [(_time(row), bool(row.ArmState)) for row in rows["ARM"]]
-    told.sort()
-    # A log begins with the arming: of that itself it may say nothing.
-    before = not told[0][1] if told else True
-    return ((-math.inf, before), *told)
-
-
-def _longest(flight: Recorded) -> Recorded:
-    """Return the longest stretch of moving flight without a pause in the log."""
-    cuts = np.flatnonzero(np.diff(flight.time_s) > PAUSE_S) + 1
-    stretches = np.split(np.arange(len(flight.time_s)), cuts)
-    found: list[tuple[float, float]] = []
-    for rows in stretches:
-        moving = rows[flight.speed_m_s[rows] > MOVING_M_S]
-        if len(moving):
-            first_s, last_s = flight.time_s[rows[[0, -1]]]
-            begin_s, end_s = flight.time_s[moving[[0, -1]]]
-            found.append((max(begin_s - BEFORE_S, first_s), min(end_s + AFTER_S, last_s)))
-    begin_s, end_s = max(found, key=lambda span: span[1] - span[0], default=(0.0, 0.0))
-    if not end_s - begin_s >= LEAST_S:
-        raise ConfigError(f"{flight.name}: no flight in it: nothing moves for {LEAST_S:g} s")
-    part = flight.between(begin_s, end_s)
-    notes = list(flight.notes)
-    if len(stretches) > 1:
-        notes.append(
-            f"the log pauses {len(stretches) - 1} times for over {PAUSE_S:g} s: only its longest "
-            f"stretch is flown, {end_s - begin_s:.0f} s"
+def _telemetry(path: Path) -> Recorded:
+    """Return what the first autopilot told, by its own stamps."""
+    told: dict[str, list[tuple[float, Any]]] = {
+        "GLOBAL_POSITION_INT": [], "HEARTBEAT": [], "GPS_RAW_INT": []
+    }  # fmt: skip
+    now_s, boot_s, listener, autopilot = 0.0, 0.0, Listener(), None
+    for frame in _frames(path.read_bytes()):
+        for message in listener.messages(frame):
+            kind, who = message.get_type(), sender(message)
+            if kind not in told or who[1] != AUTOPILOT_COMPONENT or autopilot not in (None, who):
+                continue
+            at_s = boot_s + getattr(message, "time_boot_ms", (now_s - boot_s) * 1e3) * 1e-3
+            if at_s < now_s - PAUSE_S:
+                # It has begun anew: what follows is another flight.
+                boot_s += now_s + 2.0 * AFTER_S - at_s
+                continue
+            autopilot, now_s = who, max(at_s, now_s)
+            told[kind].append((now_s, message))
+    fixes = told["GPS_RAW_INT"]
+    rows = [
+        (
+            at_s, m.lat * 1e-7, m.lon * 1e-7, m.relative_alt * 1e-3, m.vx * 0.01, m.vy * 0.01,
+            m.vz * 0.01, m.hdg * 0.01,
         )
-    gaps = np.diff(part.time_s)
-    missing = int((gaps > 1.5 * np.median(gaps)).sum())
-    if missing:
-        notes.append(f"{missing} gaps in the states, {gaps.max():.2f} s at most: kept as they are")
-    return replace(part, notes=tuple(notes))
+        for at_s, m in told["GLOBAL_POSITION_INT"]
+    ]  # fmt: skip
+    return Recorded(
+        name=path.name,
+        states=table_of(np.array(rows).reshape(-1, len(COLUMNS)).T),
+        modes=[(at_s, _copter(m.custom_mode)) for at_s, m in told["HEARTBEAT"]],
+        armed=[(at_s, bool(m.base_mode & 128)) for at_s, m in told["HEARTBEAT"]],
+        fixes=[(at_s, m.fix_type) for at_s, m in fixes],
+        receiver=np.array([(at_s, m.lat * 1e-7, m.lon * 1e-7) for at_s, m in fixes]).T,
+    )
+
+
+def _frames(raw: bytes) -> Iterator[bytes]:
+    """Yield the frames of a telemetry log: before each stand eight bytes of time."""
+    at = 8
+    while at + 8 < len(raw):
+        more = 8 if raw[at] == 0xFE else 12 + 13 * (raw[at + 2] & 1)
+        yield raw[at : at + raw[at + 1] + more]
+        at += raw[at + 1] + more + 8
+
+
+# ----------------------------------------------------------------------------------------- ULog
+
+_NAV_STATES = {
+    0: "MANUAL", 1: "ALTCTL", 2: "POSCTL", 3: "MISSION", 4: "LOITER", 5: "RTL", 14: "OFFBOARD",
+    17: "TAKEOFF", 18: "LAND",
+}  # fmt: skip
+
+
+def _ulog(path: Path) -> Recorded:
+    try:
+        from pyulog import ULog
+    except ImportError:
+        raise ConfigError(f"{path}: pyulog reads it; {install_command('office')}") from None
+    topics = ["vehicle_local_position", "vehicle_status", "vehicle_gps_position"]
+    data = {each.name: each.data for each in ULog(str(path), topics).data_list if not each.multi_id}
+    local, status, gps = (data[topic] for topic in topics)
+    known = local["xy_global"] > 0
+    local = {name: values[known] for name, values in local.items()}
+    earth = Earth(float(local["ref_lat"][0]), float(local["ref_lon"][0]))
+    place = earth.to_geographic_all(local["y"], local["x"])
+    time_s, changed_s, fixed_s = (each["timestamp"] * 1e-6 for each in (local, status, gps))
+    nose = np.degrees(local["heading"]) % 360.0
+    moves = local["vx"], local["vy"], local["vz"]
+    here = (
+        (gps["latitude_deg"], gps["longitude_deg"])
+        if "latitude_deg" in gps
+        else (gps["lat"] * 1e-7, gps["lon"] * 1e-7)
+    )
+    modes = [_NAV_STATES.get(int(state), f"MODE {state}") for state in status["nav_state"]]
+    return Recorded(
+        name=path.name,
+        states=table_of([time_s, *place, -local["z"], *moves, nose]),
+        modes=list(zip(changed_s, modes, strict=True)),
+        armed=list(zip(changed_s, status["arming_state"] == 2, strict=True)),
+        fixes=list(zip(fixed_s, gps["fix_type"], strict=True)),
+        receiver=np.array([fixed_s, *here]),
+    )
+
+
+_READERS: dict[str, Callable[[Path], Recorded]] = {
+    ".bin": _dataflash, ".tlog": _telemetry, ".ulg": _ulog
+}  # fmt: skip

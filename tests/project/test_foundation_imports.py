@@ -18,7 +18,7 @@ SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob
 
 # Where each of these may be imported; a folder stands for all below it.
 ALLOWED = {
-    "pymavlink": ("companion/link", "sitl/stub"),
+    "pymavlink": ("companion/link", "sitl/stub", "sitl/recorded.py"),
     "mavsdk": ("missions/upload/",),
     "serial": ("companion/link", "sitl/stub"),
     "pydantic": (
