@@ -26,6 +26,7 @@ from analysis.track import rise_over
 from analysis.transitions import SmoothTrack
 from companion.assembly import refuse_mismatch
 from companion.config import load
+from companion.core.frame import LocalFrame
 from companion.core.nozzle import RANGE_SLACK, allowed_duty, flow_for_rate
 from companion.core.prescription import Prescription, Zone
 from companion.core.schedule import TRIM_AGAIN_S, TRIM_STEP_MAX
@@ -51,8 +52,7 @@ from sitl.fly_files import draw
 from sitl.knowledge import perfect_setup
 from sitl.outputs import SERVO_FRAME_S, WIRE_S
 from sitl.profile import MeasuredSet, PlantProfile, Pulsing, load_profile
-from sitl.recorded import COLUMNS, MOVING_M_S, Recorded, held, read_flight, rows_of
-from sitl.smoother import true_path
+from sitl.recorded import COLUMNS, MOVING_M_S, Recorded, held, paths_of, read_flight, rows_of
 
 if TYPE_CHECKING:
     from analysis.strips import Strip
@@ -114,39 +114,36 @@ def prepare(options: AlongOptions) -> Bed:
     states = flight.states
     if setup.pumping is not None or setup.atomisers:
         raise ConfigError(f"{config.path}: --along judges PWM valves, and here is a pump or more")
-    rate_hz = options.position_rate_hz or float(config.link.position_rate_hz)
+    rate_hz = options.position_rate_hz
+    if rate_hz is None:
+        rate_hz = float(config.link.position_rate_hz)
     if not RATE_MIN_HZ <= rate_hz <= RATE_MAX_HZ:
         raise ConfigError(
             f"--position-rate-hz {rate_hz:g}: give {RATE_MIN_HZ:g} to {RATE_MAX_HZ:g}"
         )
-    path, place_m = path_of(flight, setup)
-    notes = list(flight.notes)
+    earth, notes = _earth(setup), list(flight.notes)
+    path, told = paths_of(flight, earth)
     line = shapely.LineString(np.column_stack((path.east_m, path.north_m)))
     if options.config is None or line.intersection(setup.prescription.field).length < ZONE_MIN_M:
-        here = replace(
-            setup.frame,
-            latitude_deg=float(states.latitude_deg[0]),
-            longitude_deg=float(states.longitude_deg[0]),
-        )
-        setup = replace(setup, frame=here)
-        path, place_m = path_of(flight, setup)
-        ground = zones_along(path, setup, seed=options.seed)
-        setup = replace(setup, prescription=ground, lines=None, overlap=None, treated=None)
+        here = LocalFrame(*(float(states[name][0]) for name in COLUMNS[1:3]))
+        setup = replace(setup, frame=here, lines=None, overlap=None, treated=None)
+        earth = _earth(setup)
+        path, told = paths_of(flight, earth)
+        setup = replace(setup, prescription=zones_along(path, setup, seed=options.seed))
         notes.append(
-            f"no map under this flight: {ground.zone_count} zones of {ZONE_MIN_M:g} to "
+            f"no map under this flight: {setup.prescription.zone_count} zones of {ZONE_MIN_M:g} to "
             f"{ZONE_MAX_M:g} m were laid across it"
         )
-    at = path.at(states.time_s)
-    off_m = np.hypot(place_m[:, 0] - at.east_m, place_m[:, 1] - at.north_m)
+    off_m2 = (told.east_m - path.east_m) ** 2 + (told.north_m - path.north_m) ** 2
     notes.append(
-        f"told and smoothed places are {math.sqrt(float((off_m**2).mean())):.2f} m apart (rms): "
+        f"told and smoothed places are {math.sqrt(float(off_m2.mean())):.2f} m apart (rms): "
         "claim nothing finer"
     )
     limits, eased = _eased(setup.limits, flight)
     lag = replace(setup.lag, position_s=POSITION_S)
     return Bed(
         flight=flight,
-        told=_told(flight, path, place_m, Earth(*_origin(setup)), rate_hz, notes),
+        told=_told(flight, told, earth, rate_hz, notes),
         path=path,
         setup=replace(setup, limits=limits, lag=lag),
         profile=_plant(options.plant, setup),
@@ -156,24 +153,13 @@ def prepare(options: AlongOptions) -> Bed:
     )
 
 
-def _origin(setup: Setup) -> tuple[float, float]:
-    return setup.frame.latitude_deg, setup.frame.longitude_deg
-
-
-def path_of(flight: Recorded, setup: Setup) -> tuple[Trajectory, Floats]:
-    """Return the smoothed path in the map's frame, and the places that were told."""
-    states = flight.states
-    earth = Earth(*_origin(setup))
-    place_m = np.column_stack(earth.to_local_all(states.latitude_deg, states.longitude_deg))
-    moves = np.column_stack((states.east_m_s, states.north_m_s))
-    height_m = float(np.median(states.height_m))
-    return true_path(states.time_s, place_m, moves, states.heading_deg, height_m), place_m
+def _earth(setup: Setup) -> Earth:
+    return Earth(setup.frame.latitude_deg, setup.frame.longitude_deg)
 
 
 def _told(
-    flight: Recorded, path: Trajectory, place_m: Floats, earth: Earth, rate_hz: float,
-    notes: list[str],
-) -> Any:  # fmt: skip
+    flight: Recorded, told: Trajectory, earth: Earth, rate_hz: float, notes: list[str]
+) -> Any:
     """Return the states at a rate: rows left out, or some put between two."""
     states = flight.states
     if rate_hz <= 1.05 * flight.rate_hz:
@@ -183,7 +169,12 @@ def _told(
         f"the log holds {flight.rate_hz:.0f} states a second: those between are made of the one "
         "before and the one after, which nobody knows in flight"
     )
-    return states_at(states, path, place_m, earth, _between(states.time_s, rate_hz))
+    at_s = _between(states.time_s, rate_hz)
+    at = told.at(at_s)
+    height_m, down_m_s = (np.interp(at_s, states.time_s, states[COLUMNS[i]]) for i in (3, 6))
+    place = earth.to_geographic_all(at.east_m, at.north_m)
+    moves = at.velocity_north_m_s, at.velocity_east_m_s, down_m_s
+    return rows_of([at_s, *place, height_m, *moves, at.heading_deg % 360.0])
 
 
 def _between(time_s: Floats, rate_hz: float) -> Floats:
@@ -194,18 +185,6 @@ def _between(time_s: Floats, rate_hz: float) -> Floats:
     places = [i + np.arange(part) / part for i, part in enumerate(parts.tolist())]
     found: Floats = np.interp(np.concatenate(places), number, time_s)
     return found
-
-
-def states_at(states: Any, path: Trajectory, place_m: Floats, earth: Earth, at_s: Floats) -> Any:
-    """Return states at any times: along the path, as far off it as those around were told."""
-    turned = np.unwrap(states.heading_deg, period=360.0)
-    found = {name: np.interp(at_s, states.time_s, states[name]) for name in COLUMNS}
-    found["heading_deg"] = np.interp(at_s, states.time_s, turned)
-    then, now = path.at(states.time_s), path.at(at_s)
-    east_m = now.east_m + np.interp(at_s, states.time_s, place_m[:, 0] - then.east_m)
-    north_m = now.north_m + np.interp(at_s, states.time_s, place_m[:, 1] - then.north_m)
-    found["latitude_deg"], found["longitude_deg"] = earth.to_geographic_all(east_m, north_m)
-    return rows_of(found.values())
 
 
 def zones_along(path: Trajectory, setup: Setup, *, seed: int) -> Prescription:

@@ -70,6 +70,10 @@ def serve(
     mission: Annotated[
         Path | None, typer.Option(help="Mission, .plan or .waypoints; default: the example field.")
     ] = None,
+    along: Annotated[
+        Path | None,
+        typer.Option(metavar="LOG", help="In place of a mission: a flight really flown."),
+    ] = None,
     wait_mission: Annotated[
         bool, typer.Option("--wait-mission", help="Wait for a mission to be uploaded, then fly it.")
     ] = False,
@@ -139,6 +143,7 @@ def serve(
         stations=tuple(station or ()),
         autopilot=autopilot,
         mission=mission,
+        along=along,
         wait_mission=wait_mission,
         lines=lines,
         scenario=scenario,
@@ -176,7 +181,7 @@ def fly(
     mission: Annotated[Path | None, typer.Option(help="Mission, .plan or .waypoints.")] = None,
     along: Annotated[
         Path | None,
-        typer.Option(metavar="LOG", help="In place of a mission: a flight really flown (.BIN)."),
+        typer.Option(metavar="LOG", help="In place of a mission: a log of a flight really flown."),
     ] = None,
     position_rate_hz: Annotated[
         float | None,

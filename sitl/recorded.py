@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing
 from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from pathlib import Path
@@ -22,7 +21,9 @@ from companion.errors import ConfigError
 from companion.flight_modes import COPTER
 from companion.wording import install_command
 from sitl.earth import Earth
+from sitl.smoother import true_path
 from sitl.stub.protocol import AUTOPILOT_COMPONENT, Listener, sender
+from sitl.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 Held = list[tuple[float, Any]]
@@ -64,6 +65,30 @@ class Recorded:
         return float(1.0 / np.median(np.diff(self.states.time_s)))
 
 
+def paths_of(flight: Recorded, earth: Earth) -> tuple[Trajectory, Trajectory]:
+    """Return the smoothed path, and what was told all along it: as far off it as it was around."""
+    states = flight.states
+    place_m = np.column_stack(earth.to_local_all(states.latitude_deg, states.longitude_deg))
+    moves = np.column_stack((states.east_m_s, states.north_m_s))
+    height_m = float(np.median(states.height_m))
+    path = true_path(states.time_s, place_m, moves, states.heading_deg, height_m)
+    then = path.at(states.time_s)
+    off_m = place_m - np.column_stack((then.east_m, then.north_m))
+
+    def told(values: Floats) -> Floats:
+        found: Floats = np.interp(path.time_s, states.time_s, values)
+        return found
+
+    return path, replace(
+        path,
+        east_m=path.east_m + told(off_m[:, 0]),
+        north_m=path.north_m + told(off_m[:, 1]),
+        velocity_east_m_s=told(states.east_m_s),
+        velocity_north_m_s=told(states.north_m_s),
+        heading_deg=told(_turn(states.heading_deg)),
+    )
+
+
 def held(told: Held, now_s: float, default: Any) -> Any:
     """Return what holds at a time, of what was told in order of time.
 
@@ -99,11 +124,13 @@ def read_flight(path: Path, allows: Callable[[str], bool] = bool) -> Recorded:
     try:
         flight = reader(path)
         return _longest(flight, allows) or _longest(flight, bool) or _refuse(path)
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror or error}; give a log") from error
-    except (ValueError, LookupError, AttributeError, TypeError) as error:
+    except ConfigError:
+        raise
+    except Exception as error:
+        # Readers raise whatever they like, and lines of it.
+        why = " ".join((getattr(error, "strerror", None) or repr(error)).split())
         raise ConfigError(
-            f"{path}: no {path.suffix} of a flight ({error!r}); it takes place, speed and heading"
+            f"{path}: no {path.suffix} of a flight ({why}); it takes place, speed and heading"
         ) from error
 
 
@@ -170,10 +197,15 @@ def _dataflash(path: Path) -> Recorded:
     from pymavlink import DFReader
 
     rows: dict[str, list[Any]] = {kind: [] for kind in _KINDS}
-    log = DFReader.DFReader_binary(str(path))
-    with closing(log.filehandle), closing(log.data_map):
+    log: Any = object.__new__(DFReader.DFReader_binary)
+    try:
+        log.__init__(str(path))
         while (row := log.recv_match(type=_KINDS)) is not None:
             rows[row.get_type()].append(row)
+    finally:
+        # It leaves its file open, and where it fails too.
+        if hasattr(log, "filehandle"):
+            log.filehandle.close()
     place = _columns(rows["POS"], "Lat", "Lng", "RelHomeAlt")
     nose = _columns(rows["ATT"], "Yaw")
     nose[1] = _turn(nose[1])
@@ -267,7 +299,9 @@ def _ulog(path: Path) -> Recorded:
     except ImportError:
         raise ConfigError(f"{path}: pyulog reads it; {install_command('office')}") from None
     topics = ["vehicle_local_position", "vehicle_status", "vehicle_gps_position"]
-    data = {each.name: each.data for each in ULog(str(path), topics).data_list if not each.multi_id}
+    with path.open("rb") as file:
+        found = ULog(file, topics).data_list
+    data = {each.name: each.data for each in found if not each.multi_id}
     local, status, gps = (data[topic] for topic in topics)
     known = local["xy_global"] > 0
     local = {name: values[known] for name, values in local.items()}

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,9 @@ from companion.errors import ConfigError
 from missions.maps.compiling import compiled_setup
 from sitl.anyang import EXAMPLE
 from sitl.earth import Earth
+from sitl.follow import Along, Told, along
 from sitl.profile import FlowLaw, load_profile
+from sitl.recorded import COLUMNS, held, read_flight
 from sitl.serve_mission import (
     MissionWatch,
     first_course_deg,
@@ -35,7 +38,7 @@ from sitl.serve_mission import (
 )
 from sitl.stub.autopilot import Autopilot
 from sitl.stub.firmware import Firmware
-from sitl.stub.mission_items import AUTO, LAND, LOITER, MissionItem, Phase
+from sitl.stub.mission_items import AUTO, LAND, LOITER, MODE_NAMES, MissionItem, Phase
 from sitl.stub.parameters import OUTPUT_COUNT
 from sitl.stub.protocol import (
     AUTOPILOT_SYSTEM,
@@ -172,6 +175,33 @@ class Operator:
         self._autopilot.relay(self._ground.frame(command))
 
 
+_NUMBERS = {"MISSION": AUTO} | {name: number for number, name in MODE_NAMES.items()}
+
+
+class Following(Operator):
+    """The operator of a flight that was flown: arms and changes modes as it was done then."""
+
+    def __init__(self, autopilot: Autopilot, motions: tuple[Along, Along], **more: Any) -> None:
+        super().__init__(autopilot, **more)
+        self._motions = motions
+
+    def _take_off(self, now_s: float) -> None:
+        flight, (truth, told) = self._autopilot.flight, self._motions
+        truth.start_s = told.start_s = now_s
+        flight.world.begin(truth, now_s=now_s)
+        flight.armed, flight.phase, flight.will_land = True, Phase.ROUTE, False
+        self.step = Step.FLYING
+
+    def _attend(self, now_s: float) -> None:
+        flight, (truth, _) = self._autopilot.flight, self._motions
+        log, at_s = truth.flight, truth.log_s(now_s)
+        if flight.phase is Phase.ROUTE:
+            flight.mode = _NUMBERS.get(held(log.modes, at_s, ""), LOITER)
+            flight.armed = bool(held(log.armed, at_s, default=True))
+        flight.will_land = flight.phase is Phase.HOVER
+        super()._attend(now_s)
+
+
 DEFAULT_LINK = "udpout:127.0.0.1:14550"
 _SAY_EVERY_S = 5.0
 _AFTER_LANDING_S = 1.0
@@ -196,6 +226,7 @@ class ServeOptions:
     stations: tuple[str, ...] = ()
     autopilot: str = "ardupilot"
     mission: Path | None = None
+    along: Path | None = None
     wait_mission: bool = False
     place_deg: tuple[float, float] | None = None
     lines: Path | None = None
@@ -243,15 +274,15 @@ class _Run:
             raise ConfigError(f"--wait-s {options.wait_s:g}: give 0 or more seconds")
         if not 0.5 <= options.speed_m_s <= 20.0:
             raise ConfigError(f"--speed {options.speed_m_s}: give 0.5 to 20 m/s")
-        if options.wait_mission and options.mission is not None:
-            raise ConfigError("--wait-mission and --mission exclude each other")
+        if sum(map(bool, (options.wait_mission, options.mission, options.along))) > 1:
+            raise ConfigError("--wait-mission, --mission and --along exclude each other")
         if options.place_deg is not None and not options.wait_mission:
             raise ConfigError("--home is for --wait-mission; a mission file has its own home")
         config = self._config = _config(options)
         scenario = load_scenario(options.scenario) if options.scenario else Scenario()
         # Read before the flight: lines or a map that cannot be used are told now, not after it.
         self._setup = compiled_setup(config) if options.wait_mission or options.lines else None
-        home, items = _start(options, scenario, config, self._setup)
+        home, items, motions = _start(options, scenario, config, self._setup)
         start_s = time.monotonic() if start_s is None else start_s
         self.sprayer = Sprayer(sprayer_options(options, config, scenario), start_s=start_s)
         self.autopilot = build_autopilot(
@@ -266,6 +297,7 @@ class _Run:
                 scenario=scenario,
                 signing_time=round((time.time() - _EPOCH_2015_S) * 1e5),
                 seed=options.seed,
+                believed=None if motions is None else Told(motions[1]),
             ),
             start_s=start_s,
             written=self.sprayer.take,
@@ -273,7 +305,8 @@ class _Run:
         self.autopilot.utc_offset_s = time.time() - start_s
         self.autopilot.batteries = self.sprayer.batteries
         self.mission = MissionWatch(self.autopilot, say)
-        self.operator = Operator(
+        acts = Operator if motions is None else partial(Following, motions=motions)
+        self.operator = acts(
             self.autopilot,
             enable=options.enable,
             key=self.autopilot.key,
@@ -428,14 +461,18 @@ def _config(options: ServeOptions) -> Config:
 
 def _start(
     options: ServeOptions, scenario: Scenario, config: Config, setup: Setup | None
-) -> tuple[Earth, tuple[MissionItem, ...]]:
-    """Return where the vehicle stands, and its mission if it has one."""
+) -> tuple[Earth, tuple[MissionItem, ...], tuple[Along, Along] | None]:
+    """Return where the vehicle stands, its mission if it has one, or how it flies without."""
     firmware = _firmware(options.autopilot, scenario)
+    if options.along is not None:
+        flight = read_flight(options.along)
+        home = Earth(*(float(flight.states[name][0]) for name in COLUMNS[1:3]))
+        return home, (), along(flight, home)
     if setup is not None and options.wait_mission:
         is_example = options.field_config is None
-        return waiting_place(options.place_deg, config, setup, is_example=is_example), ()
+        return waiting_place(options.place_deg, config, setup, is_example=is_example), (), None
     items = mission_items(options.mission, options.speed_m_s, firmware)
-    return home_of(items), items
+    return home_of(items), items, None
 
 
 # The sprayer behind a simulated autopilot, as configuration and scenario wire it.

@@ -43,7 +43,8 @@ class StubOptions:
     """What a stub is made of; home is where it stands and the origin of its frame.
 
     `faults` come on top of those of the scenario; `noise` takes the place of the firmware's and
-    of the scenario's. `signing_time` is the time stamp that a signed link begins with.
+    of the scenario's, `believed` that of the estimate that they would make. `signing_time` is the
+    time stamp that a signed link begins with.
     """
 
     home: Earth
@@ -59,6 +60,7 @@ class StubOptions:
     faults: tuple[Fault, ...] = ()
     signing_time: int = 0
     seed: int = 0
+    believed: Estimator | None = None
 
 
 def build_autopilot(
@@ -88,7 +90,7 @@ def build_autopilot(
         Parts(
             firmware=firmware,
             flight=flight,
-            estimator=Estimator(world, noise_of(options), seed=options.seed),
+            estimator=options.believed or Estimator(world, noise_of(options), seed=options.seed),
             outputs=_outputs(firmware, parameters, written),
             parameters=parameters,
             faults=faults,

@@ -1,15 +1,33 @@
-"""Flights along logs of flights that were really flown; VRSPRAY_REAL says where those are."""
+"""Flights along logs: of a made-up flight, and of real ones in the folder VRSPRAY_REAL."""
 
 from __future__ import annotations
 
 import os
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sitl.along import AlongOptions, Bed, figures_of, fly_method, prepare
+from companion.errors import ConfigError
+from sitl.along import (
+    METHODS,
+    AlongOptions,
+    Bed,
+    along_lines,
+    figures_of,
+    fly_along,
+    fly_method,
+    prepare,
+)
+from sitl.earth import Earth
+from sitl.follow import Told, along
+from sitl.recorded import read_flight
+from sitl.serve import Following, Step
+from sitl.stub.protocol import dialect
+from tests import flown_logs
+from tests.sitl.stub_bench import Bench
 
 LOGS = Path(os.environ.get("VRSPRAY_REAL", "")) / "flights"
 needs_logs = pytest.mark.skipif(
@@ -17,8 +35,210 @@ needs_logs = pytest.mark.skipif(
 )
 
 
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return flown_logs.telemetry(tmp_path_factory.mktemp("log") / "made-up.tlog")
+
+
+# ------------------------------------------------------------------------------------------ reading
+
+
+@pytest.mark.parametrize("form", ["tlog", "ulg"])
+def test_every_kind_of_log_tells_the_same_flight(form: str, tmp_path: Path) -> None:
+    if form == "ulg":
+        pytest.importorskip("pyulog")
+    write = flown_logs.telemetry if form == "tlog" else flown_logs.ulog
+    flight = read_flight(write(tmp_path / f"a.{form}"))
+    rows = flown_logs.told()
+    rows = rows[np.isin(np.round(rows[:, 0], 3), np.round(flight.states.time_s, 3))]
+    assert len(rows) == len(flight.states) > 200
+    assert flight.states.latitude_deg == pytest.approx(rows[:, 1], abs=2e-7)
+    assert flight.states.longitude_deg == pytest.approx(rows[:, 2], abs=2e-7)
+    assert flight.states.north_m_s == pytest.approx(rows[:, 3], abs=0.006)
+    assert flight.states.east_m_s == pytest.approx(rows[:, 4], abs=0.006)
+    turned = (flight.states.heading_deg - rows[:, 5] + 180.0) % 360.0 - 180.0
+    assert np.abs(turned).max() < 0.02
+    assert {mode for _, mode in flight.modes} == {"AUTO" if form == "tlog" else "MISSION"}
+    assert all(armed for _, armed in flight.armed)
+    assert {fix for _, fix in flight.fixes} == {6}
+    assert flight.receiver.shape[0] == 3
+
+
+def test_a_log_that_pauses_is_two_flights_and_the_longer_one_is_flown(tmp_path: Path) -> None:
+    path = flown_logs.telemetry(tmp_path / "a.tlog", skip_s=(106.0, 109.0))
+    flight = read_flight(path)
+    assert flight.states.time_s[0] >= 109.0
+    assert flight.notes == ("2 stretches of flight in the log: the longest is flown",)
+    short = read_flight(flown_logs.telemetry(tmp_path / "b.tlog", skip_s=(108.0, 108.5)))
+    assert short.notes == ("1 gaps between states, of up to 0.60 s: as they are",)
+
+
+def test_an_autopilot_that_begins_anew_has_flown_twice(log: Path, tmp_path: Path) -> None:
+    twice = tmp_path / "twice.tlog"
+    twice.write_bytes(log.read_bytes() * 2)
+    flight = read_flight(twice)
+    assert flight.states.time_s == pytest.approx(read_flight(log).states.time_s, abs=1e-6)
+    assert any("2 stretches" in note for note in flight.notes)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "why"),
+    [
+        ("a.tlog", b"", "no flight"),
+        ("a.tlog", b"\0" * 5000, "no flight"),
+        ("a.bin", b"", "no .bin of a flight"),
+        ("a.bin", b"\xa3\x95\x80" + b"x" * 5000, "no"),
+        ("a.csv", b"1,2", "give a log as .bin, .tlog, .ulg"),
+        ("a.ulg", b"ULog", "no .ulg of a flight"),
+        ("missing.tlog", None, "No such file"),
+    ],
+)
+def test_what_is_no_log_is_refused_in_one_line(
+    name: str, content: bytes | None, why: str, tmp_path: Path
+) -> None:
+    if name.endswith("ulg"):
+        pytest.importorskip("pyulog")
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ConfigError) as refused:
+        read_flight(path)
+    assert why in str(refused.value)
+    assert str(path) in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_without_pyulog_a_line_says_how_to_get_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyulog", None)
+    with pytest.raises(ConfigError, match=r"pyulog reads it; .*vrspray\[office\]"):
+        read_flight(flown_logs.ulog(tmp_path / "a.ulg"))
+
+
+# ----------------------------------------------------------------------------------------- the path
+
+
+def test_the_smoothed_path_is_nearer_to_the_truth_than_what_was_told(log: Path) -> None:
+    bed = prepare(AlongOptions(log=log, position_rate_hz=10.0))
+    truth = flown_logs.flown().at(bed.path.time_s)
+    east_m, north_m = Earth(*_origin(bed)).to_local_all(
+        *flown_logs.HOME.to_geographic_all(truth.east_m, truth.north_m)
+    )
+    off_m = np.hypot(bed.path.east_m - east_m, bed.path.north_m - north_m)
+    assert float(np.sqrt((off_m**2).mean())) < 0.015  # told: 0.028
+    turned = (bed.path.heading_deg - truth.heading_deg + 180.0) % 360.0 - 180.0
+    assert np.abs(turned).mean() < 0.2
+
+
+def _origin(bed: Bed) -> tuple[float, float]:
+    return bed.setup.frame.latitude_deg, bed.setup.frame.longitude_deg
+
+
+def test_rates_leave_states_out_or_put_some_between_and_none_into_a_gap(
+    log: Path, tmp_path: Path
+) -> None:
+    every = read_flight(log).states
+    half = prepare(AlongOptions(log=log, position_rate_hz=5.0))
+    assert np.isin(half.told.time_s, every.time_s).all()
+    assert len(half.told) == pytest.approx(len(every) / 2, abs=1)
+    assert not any("knows in flight" in note for note in half.notes)
+    path = flown_logs.telemetry(tmp_path / "gap.tlog", skip_s=(108.0, 108.6))
+    double = prepare(AlongOptions(log=path, position_rate_hz=20.0))
+    steps_s = np.diff(double.told.time_s)
+    assert float(np.median(steps_s)) == pytest.approx(0.05, abs=0.001)
+    assert (steps_s > 0.51).sum() == 1
+    assert any("nobody knows in flight" in note for note in double.notes)
+
+
+# ------------------------------------------------------------------------------------- closed loop
+
+
+def test_a_flight_is_judged_beside_its_references(log: Path, tmp_path: Path) -> None:
+    options = AlongOptions(log=log, position_rate_hz=10.0, flights=1, out=tmp_path / "out")
+    said: list[str] = []
+    result = fly_along(options, said.append)
+    rows = {row["method"]: row for row in result["methods"]}
+    assert tuple(rows) == METHODS
+    wrong = {name: row["misapplied_percent"]["mean"] for name, row in rows.items()}
+    assert wrong["perfect"] < wrong["vrspray"] < wrong["none"]
+    assert wrong["perfect"] < 5.0
+    # All are judged by the same changes, which are such as can be had.
+    assert len({row["changes"] for row in rows.values()}) == 1
+    assert rows["perfect"]["changes"] > 20
+    assert rows["perfect"]["missed"] <= 0.02 * rows["perfect"]["changes"]
+    assert rows["perfect"]["lag_distance_m"]["median_abs"] < 0.06
+    assert rows["perfect"]["switch_m"]["median_abs"] < 0.05
+    assert rows["none"]["switch_m"]["mean"] > 0.3
+    assert (tmp_path / "out" / "result.json").exists()
+    pytest.importorskip("matplotlib")
+    assert (tmp_path / "out" / "along.png").stat().st_size > 20_000
+    lines = list(along_lines(result))
+    assert lines[5].startswith("look-ahead")
+    assert any(line.startswith("limits: of ") for line in lines)
+
+
+def test_a_flight_by_hand_is_sprayed_and_said_to_be_barred(tmp_path: Path) -> None:
+    path = flown_logs.telemetry(tmp_path / "hand.tlog", mode=flown_logs.LOITER)
+    bed = piece(prepare(AlongOptions(log=path, position_rate_hz=10.0)), 100.0, 109.0)
+    assert bed.notes[-1] == "sprayed here though [safety] bars it: LOITER"
+    assert fly_method(bed, "vrspray", 1).record.volume_ml[-1].sum() > 100.0
+
+
+def test_the_hidden_sprayer_has_the_period_and_the_lags_that_are_configured(log: Path) -> None:
+    bed = prepare(AlongOptions(log=log))
+    assert bed.profile.pwm.period_s == bed.setup.pwm.period_s
+    assert bed.profile.mean_lag_s == pytest.approx(
+        0.5 * (bed.setup.lag.on_s + bed.setup.lag.off_s), abs=0.001
+    )
+    assert bed.profile.lag_scatter > 0.0
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, 3.0, 100.0, float("nan")])
+def test_rates_by_which_nobody_sprays_are_refused(log: Path, rate_hz: float) -> None:
+    with pytest.raises(ConfigError, match="--position-rate-hz"):
+        prepare(AlongOptions(log=log, position_rate_hz=rate_hz))
+
+
+# ------------------------------------------------------------------------------------- on the wire
+
+
+def test_the_stub_follows_a_flight_with_its_states_and_modes(log: Path) -> None:
+    flight = read_flight(log)
+    home = Earth(*(float(flight.states[name][0]) for name in ("latitude_deg", "longitude_deg")))
+    motions = along(flight, home)
+    bench = Bench(home=home, believed=Told(motions[1]))
+    operator = Following(bench.autopilot, motions, start_s=bench.now_s)
+    bench.companion.say(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
+    position = dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT
+    bench.companion.command(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, position, 100_000.0)
+    while operator.step is not Step.DONE:
+        assert bench.now_s < 1100.0
+        bench.run(0.02)
+        operator.tick(bench.now_s)
+    start_s = motions[0].start_s
+    states, length_s = flight.states, float(np.ptp(flight.states.time_s))
+    told = [
+        m for m in bench.companion.of("GLOBAL_POSITION_INT") if 0.2 < m.at_s - start_s < length_s
+    ]
+    assert len(told) > 200
+    at_s = np.array([m.at_s for m in told]) - start_s + states.time_s[0]
+    for name, values in (
+        ("latitude_deg", [m.lat * 1e-7 for m in told]),
+        ("longitude_deg", [m.lon * 1e-7 for m in told]),
+    ):
+        wanted = np.interp(at_s, states.time_s, states[name])
+        assert np.abs(np.array(values) - wanted).max() < 3e-7
+    beats = [m for m in bench.companion.of("HEARTBEAT") if 1.1 < m.at_s - start_s < length_s - 0.1]
+    assert {m.custom_mode for m in beats} == {flown_logs.AUTO}
+    assert all(m.base_mode & 128 for m in beats)
+
+
+# ------------------------------------------------------------------------------------- real flights
+
+
 @needs_logs
-def test_the_smoothed_path_stays_by_what_was_told():
+def test_the_smoothed_path_stays_by_what_was_told() -> None:
     bed = prepare(AlongOptions(log=LOGS / "q130.BIN"))
     assert any("0.02 m apart" in note for note in bed.notes)
     path, states = bed.path.at(bed.flight.states.time_s), bed.flight.states
@@ -29,13 +249,26 @@ def test_the_smoothed_path_stays_by_what_was_told():
 
 
 @needs_logs
-def test_a_piece_of_a_real_flight_is_sprayed_better_the_more_is_known():
+def test_a_piece_of_a_real_flight_is_sprayed_better_the_more_is_known() -> None:
     bed = prepare(AlongOptions(log=LOGS / "q130.BIN", position_rate_hz=10.0))
     bed = piece(bed, 6808.0, 6818.0)
     found = [figures_of(bed, fly_method(bed, m, 1)) for m in ("perfect", "vrspray", "none")]
     perfect, ours, none = (each["misapplied_percent"] for each in found)
     assert perfect < ours < none
     assert perfect < 6.0
+
+
+@needs_logs
+def test_logs_of_all_kinds_that_were_really_written_are_read() -> None:
+    moved_m = {}
+    for path in sorted(LOGS.iterdir()):
+        flight = read_flight(path, lambda mode: mode == "AUTO")
+        way = np.trapezoid(flight.speed_m_s, flight.states.time_s)
+        moved_m[path.name] = round(float(way))
+    assert moved_m["q116.BIN"] == pytest.approx(48, abs=3)
+    assert moved_m["q130.BIN"] == pytest.approx(140, abs=5)
+    assert moved_m["q083.BIN"] == pytest.approx(295, abs=10)
+    assert moved_m["phoenix-mission1.tlog"] > 80
 
 
 def piece(bed: Bed, begin_s: float, end_s: float) -> Bed:
