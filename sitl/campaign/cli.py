@@ -70,6 +70,9 @@ def run(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Check the file and count its flights only.")
     ] = False,
+    allow_code: Annotated[
+        bool, typer.Option("--allow-code", help="Run the code that method.controller names.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Fly all flights of a campaign file into a Parquet dataset.
@@ -95,6 +98,12 @@ def run(
     if dry_run:
         answer(plan, _plan_lines(campaign), as_json=as_json)
         return
+    code = {str(given.get("method.controller", "")) for given in campaign.tried()} - {""}
+    if code and not allow_code:
+        raise ConfigError(
+            f"{file}: method.controller = '{min(code)}': this code would run on each worker; "
+            "read it, then add --allow-code"
+        )
     dataset = open_dataset(campaign, bundle, out or Path(f"{file.stem}-flights"))
     missing = sum(len(dataset.flights_of(part)) for part in dataset.missing())
     done = campaign.flights - missing

@@ -202,8 +202,8 @@ def cluster_at(address: str) -> Iterator[Cluster]:
             f"--cluster {address}: Dask is missing; {install_command('cluster')}"
         ) from error
     nobody = VrsprayError(
-        f"--cluster {address}: no Dask scheduler answers; start one with `dask scheduler` and give "
-        "the tcp:// address that it prints"
+        f"--cluster {address}: no Dask scheduler answers; start one with "
+        "`dask scheduler --host 127.0.0.1` and give the tcp:// address that it prints"
     )
     scheme, _, place = (address if "://" in address else f"tcp://{address}").partition("://")
     host, _, port = place.rpartition(":")
@@ -220,7 +220,8 @@ def cluster_at(address: str) -> Iterator[Cluster]:
             client.wait_for_workers(1, timeout=WAIT_S)
         except NobodyError as error:
             raise VrsprayError(
-                f"--cluster {address}: no worker is connected; start some: `dask worker {address}`"
+                f"--cluster {address}: no worker is connected; start some: "
+                f"`dask worker {address} --host 127.0.0.1`"
             ) from error
         yield Cluster(client)
 

@@ -61,7 +61,7 @@ MEANINGS: dict[str, str] = {
     "calibrated; perfect knowledge",
     "method.look_ahead_s": "P1's controller with this look-ahead",
     "method.dose": "P1's controller: by its Eq. 2, or by the measured curve",
-    "method.controller": "`module:Class` or `file.py:Class`; a file travels to workers, a module must be there",
+    "method.controller": "`module:Class` or `file.py:Class`; with `--allow-code` only; a file travels to workers, a module must be there",
     "plant.profile": "a sprayer's name, or a `.toml` file",
     "plant.flow_law": "true flow between measured points",
     "plant.scatter": "whether valves differ; default true",

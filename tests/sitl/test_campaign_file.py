@@ -113,3 +113,49 @@ def test_a_flight_needs_no_other_flight_before_it(tmp_path: Path) -> None:
     one = fly_flight(*campaign.flight(9)[1:], folder).figures
     fly_flight(*campaign.flight(1)[1:], folder)
     assert fly_flight(*campaign.flight(9)[1:], folder).figures == one
+
+
+MARK = """
+from pathlib import Path
+
+Path({mark!r}).touch()
+
+
+class Own:
+    def __init__(self, sprayer):
+        pass
+
+    def order(self, seen):
+        return None
+"""
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        '[[case]]\nname = "a"\n[[case]]\nname = "b"\nmethod.controller = "{name}"\n',
+        '[[vary]]\nset = "method.controller"\nvalues = ["{name}"]\n',
+    ],
+)
+@pytest.mark.parametrize("form", ["own.py:Own", "{folder}/own.py:Own", "own:Own"])
+def test_code_that_a_file_names_runs_by_the_users_word_alone(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    where: str,
+    form: str,
+) -> None:
+    mark, name = tmp_path / "it-ran", form.format(folder=tmp_path)
+    file = write_campaign(tmp_path, where.format(name=name))
+    (tmp_path / "own.py").write_text(MARK.format(mark=str(mark)))
+    monkeypatch.chdir(tmp_path)
+    given = ["campaign", str(file), "--workers", "1", "--out", str(tmp_path / "out")]
+    assert execute(given) == 2
+    line = capsys.readouterr().err.strip()
+    assert f"{file}: method.controller = '{name}'" in line
+    assert "--allow-code" in line and "\n" not in line
+    assert execute([*given, "--dry-run"]) == 0
+    assert not mark.exists()
+    if form == "own.py:Own":
+        assert execute([*given, "--allow-code"]) == 0
+        assert mark.exists()
