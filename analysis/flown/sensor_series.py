@@ -28,6 +28,7 @@ from analysis.journals.unpacking import (
     SIGN,
     Dictionaries,
     Reader,
+    check_text,
     checked,
     inflated,
     pieces_of,
@@ -279,7 +280,7 @@ def _hole_or_dict(found: dict[str, Any]) -> object:
     return _Hole(found["\x01"]) if found.keys() == {"\x01"} else found
 
 
-@lru_cache(maxsize=4096)
+@lru_cache(maxsize=256)
 def _values_of(form: str) -> tuple[str, tuple[object, ...]]:
     """Return the kind and the values of a form, a `_Hole` for each number."""
     pieces = list(pieces_of(form))
@@ -303,12 +304,12 @@ class _Numbers:
 
     def __init__(self, content: bytes) -> None:
         reader = _Reader(content)
-        count = reader.word()
-        self._forms = reader.take(reader.word()).decode("ascii").split("\n")
+        count, self._forms = reader.head()
         reader.words(count)  # the distances of the lines' numbers
         if reader.words(count).any():
             raise _UnusualError
         self._order = reader.words(count)
+        check_text(self._forms, self._order)
         self._keys = [keys_of(form) for form in self._forms]
         is_float = [[key[0] == FLOAT for key in keys] for keys in self._keys]
         held = np.array([sum(each) for each in is_float], dtype=np.int64)[self._order]

@@ -16,6 +16,7 @@ from companion.errors import UnreadableError
 from companion.journal.codec import FieldNames, decode, field_names_of
 from companion.journal.read_only import log_of, one_line
 from companion.journal.reader import OpenJournal, damaged_pages, opened
+from companion.journal.rows import DICTIONARY_BYTES
 from companion.journal.writer import Event, missing_rows
 from companion.simulated import Simulated, simulated_in
 
@@ -162,7 +163,7 @@ def damaged_blocks(connection: sqlite3.Connection) -> list[str]:
     count = 0
     try:
         dictionaries = {None: b""} | {
-            number: inflated(body, b"")
+            number: inflated(body, b"", DICTIONARY_BYTES)
             for number, body in connection.execute("SELECT id, body FROM block_dictionaries")
         }
         for first, from_s, until_s, dictionary, *parts in connection.execute(_BLOCKS):

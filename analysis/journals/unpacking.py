@@ -6,9 +6,8 @@ import sqlite3
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import accumulate
 from typing import NamedTuple
 
@@ -18,17 +17,23 @@ from companion.journal.rows import (
     ANCHORED,
     BACK,
     BITS,
+    DICTIONARY_BYTES,
     FLOAT,
     HOLE,
     NEW,
+    ROWS_MAX,
     SAME,
+    TEXT_MAX,
     WORD,
     Key,
     keys_of,
 )
 
-# A damaged length must not take the reader's memory: a block is a second of a flight.
-UNPACKED_MAX = 64_000_000
+# A few bytes must not take the reader's memory or time. A block that is full has `TEXT_MAX` of text
+# and one line more; packed, a number takes less room than its text.
+_LINE_MAX = 1_000_000
+UNPACKED_MAX = 2 * (TEXT_MAX + _LINE_MAX)
+_BITS_MAX = 70  # of an integer: the largest has fifteen digits
 _REAL = struct.Struct("<d")
 _LONG = struct.Struct("<q")
 SIGN = 1 << 63
@@ -63,11 +68,11 @@ def unpack(packed: bytes, dictionary: bytes = b"") -> list[str]:
     return part_of(inflated(packed, dictionary)).lines
 
 
-def inflated(packed: bytes, dictionary: bytes) -> bytes:
+def inflated(packed: bytes, dictionary: bytes, most: int = UNPACKED_MAX) -> bytes:
     """Return a block's content; ValueError for what is damaged."""
     worker = zlib.decompressobj(zdict=dictionary) if dictionary else zlib.decompressobj()
     try:
-        content = worker.decompress(packed, UNPACKED_MAX)
+        content = worker.decompress(packed, most + 1)
     except zlib.error as error:
         raise ValueError(f"a block is damaged: {error}") from error
     if worker.unconsumed_tail or not worker.eof:
@@ -106,17 +111,16 @@ class _Column:
         self.is_int = is_int
 
 
-@lru_cache(maxsize=4096)
 def pieces_of(form: str) -> tuple[str, ...]:
     """Return a form cut at its holes, and these between the pieces."""
     return tuple(HOLE.split(form))
 
 
 def _part(reader: Reader, leader: Part | None) -> Part:
-    count = reader.word()
-    forms = reader.take(reader.word()).decode("ascii").split("\n")
+    count, forms = reader.head()
     gaps = [signed(gap) for gap in reader.integers(count)]
     leads, order = reader.integers(count), reader.integers(count)
+    check_text(forms, order)
     columns = _columns(reader, order, [keys_of(form) for form in forms])
     pieces = [list(pieces_of(form)) for form in forms]
     holes = [[columns[key] for key in keys_of(form)] for form in forms]
@@ -220,6 +224,13 @@ class Reader:
         self._at += WORD.size
         return int(value)
 
+    def head(self) -> tuple[int, list[str]]:
+        """Return how many lines there are, and their forms."""
+        count = self.word()
+        if count > ROWS_MAX:
+            raise ValueError(f"it says {count} rows, a block has {ROWS_MAX} at most")
+        return count, self.take(self.word()).decode("ascii").split("\n")
+
     def take(self, count: int) -> bytes:
         """Return the next bytes; ValueError where there are fewer."""
         if count > len(self._content) - self._at:
@@ -243,7 +254,7 @@ class Reader:
             if value > PLENTY:
                 value &= PLENTY
                 shift = 7
-                while content[at] > PLENTY:
+                while content[at] > PLENTY and shift < _BITS_MAX:
                     value |= (content[at] & PLENTY) << shift
                     shift += 7
                     at += 1
@@ -272,6 +283,12 @@ class Reader:
         if how == BITS:
             return _from_bits(values), ()
         return _unscaled(values, how), ()
+
+
+def check_text(forms: Sequence[str], order: Iterable[int]) -> None:
+    """Refuse lines that would be longer together than those of any block."""
+    if sum(len(forms[form]) for form in order) > TEXT_MAX + _LINE_MAX:
+        raise ValueError("its lines are longer than a block's")
 
 
 def sums(words: Sequence[int]) -> list[int]:
@@ -380,7 +397,7 @@ class Dictionaries:
             row = self._connection.execute(sql, (number,)).fetchone()
             if row is None:
                 raise ValueError(f"the dictionary {number} is missing")
-            self._found[number] = inflated(row[0], b"")
+            self._found[number] = inflated(row[0], b"", DICTIONARY_BYTES)
         return self._found[number]
 
 

@@ -182,9 +182,17 @@ def _taken_apart(parts: list[str]) -> tuple[str, list[str]]:
     return "".join(parts), numbers
 
 
-@lru_cache(maxsize=4096)
+# A form of 64 valves is shorter. Of longer ones nothing is kept: a stranger's file has many.
+FORM_KEPT = 8000
+
+
 def keys_of(form: str) -> tuple[Key, ...]:
     """Return for each hole of a form what its number is: kind, object, how manieth in it."""
+    return _keys_of(form) if len(form) <= FORM_KEPT else _keys_of.__wrapped__(form)
+
+
+@lru_cache(maxsize=1024)
+def _keys_of(form: str) -> tuple[Key, ...]:
     keys = []
     inside: list[list[object]] = [["", 0]]
     for part in HOLE.split(form):
@@ -278,11 +286,13 @@ def bits_of(texts: Sequence[str]) -> list[int]:
 
 # A second of a flight has a hundred rows; a simulation has thousands, which are several blocks.
 ROWS_MAX = 1000
+# A block of 1000 rows with six valves has half a megabyte of text (measured on recorded flights).
+TEXT_MAX = 4_000_000
 # A block that serves others as their dictionary is chosen anew so often: what they save is ten
 # times what it costs.
 _DICTIONARY_EVERY = 120
 _DICTIONARY_FIRST = 5
-_DICTIONARY_BYTES = 32_000
+DICTIONARY_BYTES = 32_000
 _INSERT = "INSERT INTO blocks VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
 _INSERT_DICTIONARY = "INSERT INTO block_dictionaries VALUES (?, ?)"
 _DECISION = "Decision"
@@ -318,7 +328,7 @@ class Block:
         self._first: int | None = None
         self._last = 0
         self._times_s: list[float] = []
-        self.row_count = 0
+        self.row_count = self._text = 0
 
     def add(self, sequence: int, at_s: float, body: str) -> None:
         """Take one row."""
@@ -327,13 +337,14 @@ class Block:
         rows.add(sequence, self._first, body)
         self._last = sequence
         self.row_count += 1
+        self._text += len(body)
         if abs(at_s) < float("inf"):
             self._times_s.append(at_s)
 
     @property
     def is_full(self) -> bool:
         """Whether it should be written before more comes."""
-        return self.row_count >= ROWS_MAX
+        return self.row_count >= ROWS_MAX or self._text >= TEXT_MAX
 
     def insert(self, connection: sqlite3.Connection) -> None:
         """Write the rows as one and forget them.
@@ -361,7 +372,7 @@ class Block:
         )
         self._written += 1
         if self._written % _DICTIONARY_EVERY == _DICTIONARY_FIRST:
-            self._dictionary = b"".join(contents)[-_DICTIONARY_BYTES:]
+            self._dictionary = b"".join(contents)[-DICTIONARY_BYTES:]
             self._dictionary_id = self._first
             packed = zlib.compress(self._dictionary)
             connection.execute(_INSERT_DICTIONARY, (self._first, packed))

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 import struct
+import tracemalloc
 import zlib
 from contextlib import suppress
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from analysis.flown.sensor_series import Wanted, numbers_of, quick_numbers
 from analysis.journals.unpacking import part_of, unpack
-from companion.journal.rows import Packer, pack
+from companion.journal.rows import ROWS_MAX, TEXT_MAX, WORD, Block, Packer, pack, put_all
 
 NUMBERS = st.one_of(
     st.floats(),
@@ -144,3 +146,40 @@ def test_damage_within_numbers_is_refused_or_left_to_the_texts(junk: bytes, at: 
     content = bytearray(zlib.decompress(pack(lines)))
     content[at : at + len(junk)] = junk
     quick_numbers(zlib.compress(bytes(content)), b"", WANTED)
+
+
+# What a stranger's file may say in a few kilobytes; each once took gigabytes or minutes.
+
+ROWS = WORD.pack(3_000_000) + WORD.pack(0) + bytes(9_000_000)
+LINES = WORD.pack(1000) + WORD.pack(60_000) + b"x" * 60_000 + b"\x02" * 1000 + bytes(2000)
+NUMBERED = WORD.pack(1000) + WORD.pack(9_000) + b"\x01" * 9_000 + b"\x02" * 1000 + bytes(9_002_000)
+LONG_INTEGER = WORD.pack(1) + WORD.pack(0) + b"\xff" * 9_000_000 + b"\x01\x00\x00"
+
+
+@pytest.mark.parametrize("content", [ROWS, LINES, NUMBERED, LONG_INTEGER])
+def test_a_few_bytes_take_no_more_than_a_block_may_hold(content: bytes) -> None:
+    packed = zlib.compress(content)
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError):
+            unpack(packed)
+        assert quick_numbers(packed, b"", WANTED) is None
+        assert tracemalloc.get_traced_memory()[1] < 60e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_block_is_full_by_its_rows_or_its_text_and_can_then_be_read() -> None:
+    for body, rows in (('{"A":[1.5]}', ROWS_MAX), (json.dumps({"A": ["x" * 60_000]}), 67)):
+        block, lines = Block(), []
+        while not block.is_full:
+            block.add(len(lines) + 1, 1.0, body)
+            lines.append(body)
+        assert len(lines) == rows and len(body) * (rows - 1) < TEXT_MAX
+        assert unpack(pack(lines)) == lines
+
+
+def test_integers_of_any_row_are_read() -> None:
+    out = bytearray(WORD.pack(1) + WORD.pack(0))
+    put_all(out, [2**63])
+    assert part_of(bytes(out) + b"\x00\x00").gaps == [2**62]
