@@ -79,3 +79,19 @@ class Recorder(Protocol):
 
     def record_coverage(self, coverage: Coverage) -> None:
         """Keep which ground is treated by now; the newest counts."""
+
+
+class Record(Protocol):
+    """What the flight is kept in."""
+
+    @property
+    def fault(self) -> str | None:
+        """Why it is not kept, or soon will not be; None while all is well."""
+
+    @property
+    def saved_age_s(self) -> float:
+        """How long ago all that there was reached the disk."""
+
+
+# The record that a flight must have, and for how long it may spray without.
+Required = tuple[Record, float]

@@ -37,7 +37,14 @@ from companion.core.types import (
     VehicleState,
 )
 from companion.errors import SensorError
-from companion.ports import COMMIT_EVERY_S, PlanExecutor, Recorder, Sensor, VehicleLink
+from companion.ports import (
+    COMMIT_EVERY_S,
+    PlanExecutor,
+    Recorder,
+    Required,
+    Sensor,
+    VehicleLink,
+)
 
 _logger = logging.getLogger(__name__)
 
@@ -106,7 +113,7 @@ class ControlLoop:
         clock: Callable[[], float],
         sensors: Sequence[Sensor] = (),
         boot_clock: Callable[[], float] | None = None,
-        record_fault: Callable[[], str | None] | None = None,
+        required: Required | None = None,
         commit_every_s: float = COMMIT_EVERY_S,
     ) -> None:
         self._setup = setup
@@ -116,7 +123,8 @@ class ControlLoop:
         self._link = link
         self._executor = executor
         self._recorder = recorder
-        self._record_fault = record_fault
+        self._required = required
+        self._told_record: str | None = None
         self._ahead_s = coverage_ahead_s(commit_every_s)
         self._has_begun = False
         self._clock = clock
@@ -220,15 +228,22 @@ class ControlLoop:
             self._has_begun = False
 
     def _missing_record(self) -> str | None:
-        """Return why nothing may begin without its record; None once it has begun.
+        """Return why nothing may be sprayed without its record; None while it is kept.
 
-        A valve that closes in the middle of a field because a disk is full does more harm than a
-        gap in the record, which is counted and told.
+        A valve that closes in the middle of a field because a card is slow does more harm than a
+        record that comes late: once spraying may have begun, only what lasts closes.
         """
-        if self._record_fault is None or self._has_begun:
+        if self._required is None:
             return None
-        fault = self._record_fault()
-        return None if fault is None else f"journal: {fault}"
+        record, close_after_s = self._required
+        fault = record.fault
+        if fault is None or not self._has_begun or record.saved_age_s > close_after_s:
+            self._told_record = None
+            return None if fault is None else f"journal: {fault}"
+        if self._told_record is None:
+            self._told_record = fault
+            self._link.tell_fault(f"journal: {fault}; valves close after {close_after_s:g} s")
+        return None
 
     def _output_report(self) -> Iterator[Input]:
         """Yield what changed in the way to the valves: the link to the vehicle, or the outputs."""
@@ -293,7 +308,7 @@ async def run(
     boot_clock: Callable[[], float] | None = None,
     on_step: Callable[[], None] | None = None,
     watch: Callable[[Decision], None] | None = None,
-    record_fault: Callable[[], str | None] | None = None,
+    required: Required | None = None,
     commit_every_s: float = COMMIT_EVERY_S,
 ) -> int:
     """Spray until a signal comes or `duration_s` is over; return 0 then.
@@ -301,9 +316,9 @@ async def run(
     `on_step` is called after each step that was carried out, and at no other time: a watchdog that
     it feeds sees a loop that stands still. `watch` gets the decision then; it must not wait.
     `boot_clock`, the computer's if not given, shows that
-    this process itself stood still. `record_fault`, if given, says why the record cannot be kept:
-    a flight then does not begin to spray; one that has begun goes on. `commit_every_s` is how
-    often the recorder commits.
+    this process itself stood still. `required`, if given, is the record without which a flight does
+    not begin to spray, and how long one that has begun goes on. `commit_every_s` is how often the
+    recorder commits.
 
     Raises what went wrong otherwise, a `LinkError` for a link that cannot be opened, a
     `SensorError` for a sensor. The valves are closed before any sensor is let go. A link that
@@ -335,7 +350,7 @@ async def run(
                         clock=clock,
                         sensors=sensors,
                         boot_clock=boot_clock,
-                        record_fault=record_fault,
+                        required=required,
                         commit_every_s=commit_every_s,
                     )
                     await _turn_until_the_end(control, ending, duration_s, on_step, watch)

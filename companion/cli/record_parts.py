@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,6 +19,8 @@ if TYPE_CHECKING:
 
 # Three hours of a journal; with less a flight does not begin.
 FREE_MIN_BYTES = 100_000_000
+# No flight is removed but by its owner: the law may want it kept.
+_ROOM = "copy flights away, then remove what may go (vrspray flights prune)"
 
 
 def rules_of(journal: JournalTable) -> Rules:
@@ -33,8 +34,8 @@ def rules_of(journal: JournalTable) -> Rules:
     )
 
 
-def made_ready(folder: Path, journal: JournalTable) -> Iterator[str]:
-    """Recover what a crash left and make room; yield what was done, a line each.
+def made_ready(folder: Path) -> Iterator[str]:
+    """Recover what a crash left; yield what was done, a line each.
 
     A JournalError where there is no room for a flight. What cannot be looked after is said and
     left: an old journal is no reason not to fly.
@@ -42,28 +43,21 @@ def made_ready(folder: Path, journal: JournalTable) -> Iterator[str]:
     if not folder.is_dir():
         return
     # Who has not flown yet has nothing to look after.
-    from companion.journal.folder import WARN_FREE_PERCENT, prune, recover_folder, space_of
+    from companion.journal.folder import WARN_FREE_PERCENT, recover_folder, space_of
 
     try:
         for found in recover_folder(folder):
             yield f"journal: {found.path.name}: {found.outcome}: {found.text}"
     except (JournalError, *DAMAGE) as error:
         yield f"warning: journal: {one_line(error)}"
-    try:
-        for removal in prune(folder, rules_of(journal), now_utc_s=time.time()):
-            what = removal.problem or "removed"
-            yield f"journal: {removal.flight.path.name}: {what}: {removal.reason}"
-    except (JournalError, *DAMAGE) as error:
-        yield f"warning: journal: {one_line(error)}"
     space = space_of(folder)
     if space.free_bytes < FREE_MIN_BYTES:
         raise JournalError(
             f"journal folder {folder}: only {space.free_bytes / 1e6:.0f} MB are free, a flight "
-            f"needs {FREE_MIN_BYTES / 1e6:.0f}; make room (vrspray flights prune) or set "
-            "journal.folder to another disk"
+            f"needs {FREE_MIN_BYTES / 1e6:.0f}; {_ROOM}, or set journal.folder to another disk"
         )
     if space.free_percent < WARN_FREE_PERCENT:
-        yield f"warning: journal: only {space.free_percent:.0f} % of the disk is free"
+        yield (f"warning: journal: only {space.free_percent:.0f} % of the disk is free; {_ROOM}")
 
 
 def follow(journal: Journal, link: VehicleLink, executor: PlanExecutor) -> None:

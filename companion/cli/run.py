@@ -115,7 +115,9 @@ def run_companion(
                     duration_s=duration_s,
                     on_step=None if notifier is None else notifier.stepped,
                     watch=screen.take,
-                    record_fault=(lambda: journal.fault) if config.journal.required else None,
+                    required=(
+                        (journal, config.journal.close_after_s) if config.journal.required else None
+                    ),
                     commit_every_s=commit_s,
                 )
             )
@@ -172,7 +174,7 @@ def _new_journal(
 ) -> Journal:
     """Return the journal of this flight, in a folder that is in order and has room."""
     folder = config.resolve(config.journal.folder)
-    for line in made_ready(folder, config.journal):
+    for line in made_ready(folder):
         note(line)
     for line in _left_lines(folder, setup, training):
         note(line)

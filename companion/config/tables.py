@@ -416,8 +416,13 @@ class JournalTable(Table):
     training: bool = Field(
         default=False, description="true: flown with water; marked in every record"
     )
-    required: bool = Field(
-        default=True, description="true: a flight does not begin to spray without its record"
+    required: bool = Field(default=True, description="true: nothing is sprayed without its record")
+    close_after_s: float = Field(
+        default=60.0,
+        ge=10,
+        le=900,
+        description="in flight all valves close when for so long nothing reached the disk; "
+        "until then the record waits in memory",
     )
     commit_s: float | None = Field(
         default=None,
@@ -430,16 +435,20 @@ class JournalTable(Table):
         default=10.0,
         ge=0,
         le=90,
-        description="old flights are removed while less of the disk than this is free; 0: never",
+        description="`vrspray flights prune` removes old flights while less of the disk than this "
+        "is free; 0: never. `run` removes none",
     )
     keep_count: int | None = Field(
         default=None,
         ge=1,
         le=100_000,
-        description="largest number of flights to keep, ten or more; absent: all",
+        description="`vrspray flights prune` keeps so many flights, ten or more; absent: all",
     )
     keep_days: float | None = Field(
-        default=None, gt=0, le=100_000, description="how long flights are kept; absent: for ever"
+        default=None,
+        gt=0,
+        le=100_000,
+        description="`vrspray flights prune` keeps flights so long; absent: for ever",
     )
 
 

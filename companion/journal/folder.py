@@ -1,7 +1,7 @@
 """The folder of journals: its flights, the pinned ones, which make room, and what a crash left.
 
 A flight that has ended is never written into: a pin is an empty file beside it. Whole flights make
-room, oldest first; never an open, pinned or damaged one.
+room, oldest first, when their owner says so; never an open, pinned or damaged one.
 
 SQLite itself takes every transaction whose frames are whole and leaves out the rest. A journal is
 looked at first without writing; what is damaged stays as it is, to the byte. What can still be

@@ -10,6 +10,7 @@ A new journal's file is complete and empty before anybody sees it, then open for
 from __future__ import annotations
 
 import logging
+import math
 import os
 import platform
 import queue
@@ -147,8 +148,11 @@ def open_for_flight(path: Path) -> sqlite3.Connection:
 
 _logger = logging.getLogger(__name__)
 
-QUEUE_ROWS = 10_000  # a minute of 50 decisions and 100 inputs a second
+# A disk that hangs: a quarter of an hour of six valves, in 100 MB.
+QUEUE_ROWS = 120_000
 CLOSE_WITHIN_S = 30.0
+# Of that: how long a full disk may take until there is room again.
+ROOM_WITHIN_S = 20.0
 STALL_MAX_S = 5.0  # a card that is busy with itself takes one or two
 
 _Row = tuple[int, Item]
@@ -175,7 +179,8 @@ class Journal:
         self._commit_every_s = commit_every_s
         self._free_bytes: int | None = None
         self._space_fault: str | None = None
-        self._written_s = time.monotonic()
+        self._saved_s = time.monotonic()
+        self._give_up_s = math.inf
         self._sequence = count(1)
         self._queue_rows = queue_rows
         self._rows: queue.SimpleQueue[_Row | None] = queue.SimpleQueue()
@@ -261,15 +266,14 @@ class Journal:
     @property
     def fault(self) -> str | None:
         """Return why the record is not kept, or soon will not be; None while all is well."""
-        stands_s = time.monotonic() - self._written_s
-        if stands_s > STALL_MAX_S and not self._closing.is_set():
-            return f"nothing was written for {stands_s:.0f} s"
+        if self._writer.fault is None and self.saved_age_s > STALL_MAX_S:
+            return None if self._closing.is_set() else f"nothing was written for {STALL_MAX_S:g} s"
         return self._writer.fault or self._space_fault
 
     @property
     def saved_age_s(self) -> float:
-        """Return how long ago the file was written to."""
-        return time.monotonic() - self._written_s
+        """Return how long ago all that there was reached the disk."""
+        return time.monotonic() - self._saved_s
 
     @property
     def free_bytes(self) -> int | None:
@@ -309,6 +313,7 @@ class Journal:
 
     def close(self) -> None:
         """Write what is left and make one closed file of it; may be called twice."""
+        self._give_up_s = min(self._give_up_s, time.monotonic() + ROOM_WITHIN_S)
         self._closing.set()
         self._rows.put(None)  # wakes the writer at once
         self._thread.join(CLOSE_WITHIN_S)
@@ -349,14 +354,21 @@ class Journal:
                 if row is not None:
                     self._writer.write(*row)
                 elif self._closing.is_set() and self._rows.empty():
-                    break
+                    self._commit()
+                    if not self._writer.waiting or time.monotonic() >= self._give_up_s:
+                        break
+                    time.sleep(self._commit_every_s)
                 if time.monotonic() >= due_s:
-                    self._writer.commit(lost_before=self._dropped, coverage=self._coverage)
-                    self._look_at_space()
-                    self._written_s = time.monotonic()
-                    due_s = self._written_s + self._commit_every_s
+                    self._commit()
+                    due_s = time.monotonic() + self._commit_every_s
         finally:
             self._writer.finish(lost_before=self._dropped, coverage=self._coverage)
+
+    def _commit(self) -> None:
+        self._writer.commit(lost_before=self._dropped, coverage=self._coverage)
+        self._look_at_space()
+        if self._writer.fault is None:
+            self._saved_s = time.monotonic()
 
     def _look_at_space(self) -> None:
         """Note in time that the disk fills up."""

@@ -28,12 +28,12 @@ from __future__ import annotations
 
 import math
 import re
-import sqlite3
 import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any, Protocol
 
 from companion.core.types import SprayPlan
 
@@ -313,6 +313,13 @@ class _Rows:
         self.crc = zlib.crc32(body.encode("ascii"), self.crc)
 
 
+class Taker(Protocol):
+    """A connection, or what collects statements for one."""
+
+    def execute(self, sql: str, values: Sequence[Any], /) -> object:
+        """Take a statement."""
+
+
 class Block:
     """What has come since the last commit: number, time, line of JSON."""
 
@@ -346,16 +353,16 @@ class Block:
         """Whether it should be written before more comes."""
         return self.row_count >= ROWS_MAX or self._text >= TEXT_MAX
 
-    def insert(self, connection: sqlite3.Connection) -> None:
+    def insert(self, taker: Taker) -> None:
         """Write the rows as one and forget them.
 
-        Where that, or the commit, fails: begin with a new `Block`, for a dictionary may be lost.
+        Where what was written is lost: begin with a new `Block`, for a dictionary may be, too.
         """
         if self._first is None:
             return
         contents = [rows.packer.content() for rows in (self._inputs, self._decisions)]
         inputs, decisions = (deflated(content, self._dictionary) for content in contents)
-        connection.execute(
+        taker.execute(
             _INSERT,
             (
                 self._first,
@@ -375,7 +382,7 @@ class Block:
             self._dictionary = b"".join(contents)[-DICTIONARY_BYTES:]
             self._dictionary_id = self._first
             packed = zlib.compress(self._dictionary)
-            connection.execute(_INSERT_DICTIONARY, (self._first, packed))
+            taker.execute(_INSERT_DICTIONARY, (self._first, packed))
         self._clear()
 
 

@@ -1,8 +1,8 @@
 """The journal's side of the disk: owns the connection, lives in its own thread.
 
 One commit a second, or sooner where it is told so, so that a cut of power costs a second. Whatever
-the disk does, it does to this thread: a failure costs the rows of that second, is counted, and the
-next second is tried anew.
+the disk does, it does to this thread: what a full disk or a removed card does not take waits in
+memory, packed, and is tried again with each commit.
 
 What the flight's tables come to is told in `meta` at its end: missing rows are noticed by it.
 """
@@ -14,9 +14,11 @@ import logging
 import math
 import sqlite3
 import zlib
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from itertools import islice
+from typing import Any, Literal
 
 from companion.core.frame import LocalFrame, course_deg
 from companion.core.options.coverage import CELL_M, TILE_CELLS, Coverage
@@ -117,19 +119,9 @@ _VALVE = (
     "INSERT INTO valve_changes (planned_us, actual_us, valve, duty_permille) VALUES (?, ?, ?, ?)"
 )
 LINK_COLUMNS = (
-    "bytes_in",
-    "bytes_out",
-    "frames_in",
-    "frames_out",
-    "bad_frames",
-    "refused_frames",
-    "unsent_frames",
-    "lost_percent",
-    "frames_per_s",
-    "bytes_in_per_s",
-    "bytes_out_per_s",
-    "position_hz",
-    "round_trip_s",
+    *("bytes_in", "bytes_out", "frames_in", "frames_out", "bad_frames", "refused_frames"),
+    *("unsent_frames", "lost_percent", "frames_per_s", "bytes_in_per_s", "bytes_out_per_s"),
+    *("position_hz", "round_trip_s"),
 )
 _LINK = (
     f"INSERT INTO link_stats (time_s, {', '.join(LINK_COLUMNS)}) "
@@ -147,15 +139,42 @@ _TIME_AGAIN = (
 )
 _FROM_ORDERS = ("valve_changes", "orders")
 _CHECKPOINT_EVERY = 60  # commits
-# A full disk, a removed card, a value that JSON does not know: rows are lost, the flight goes on.
+# What is not yet on the disk waits in memory: a quarter of an hour with six valves takes 26 MB by
+# this count, and 42 of the process (`python -m tests.bench.journal held`).
+HELD_BYTES_MAX = 64_000_000
+_VALUE_BYTES = 40
+_AT_ONCE = 60  # seconds of the flight in one transaction, where some had to wait
+# A full disk, a removed card: what was to be written waits.
 _FAILURES = (sqlite3.Error, ValueError, TypeError, OverflowError)
+# A value that JSON or SQLite does not know: its row is lost, whenever it is tried again.
+_REFUSALS = (
+    *(ValueError, TypeError, OverflowError),
+    *(sqlite3.IntegrityError, sqlite3.DataError, sqlite3.ProgrammingError, sqlite3.InterfaceError),
+)
+
+
+class _Commit:
+    """What one commit writes: statements, each with how many rows of the flight are in it."""
+
+    def __init__(self) -> None:
+        self.statements: list[tuple[str, Sequence[Any], int]] = []
+        self.rows = 0
+        self.size_bytes = 0
+
+    def execute(self, sql: str, values: Sequence[Any], rows: int = 0) -> None:
+        """Take a statement as a connection does; nothing is written yet."""
+        self.statements.append((sql, values, rows))
+        self.rows += rows
+        self.size_bytes += sum(
+            _VALUE_BYTES + (len(value) if isinstance(value, bytes | str) else 0) for value in values
+        )
 
 
 Item = Input | Decision | Event | ValveOrder | LinkSample
 
 
 class Writer:
-    """Writes what it is given; never raises for what a disk can do.
+    """Writes what it is given, late if it must; never raises for what a disk can do.
 
     `next_sequence` numbers the writer's own events; `utc_offset_s` makes a time since 1970 of the
     companion's monotonic one, until the autopilot says better.
@@ -180,7 +199,9 @@ class Writer:
         self.valves = ValveRows()
         self._next_sequence = next_sequence
         self._coverage: Coverage | None = None
-        self._pending = 0
+        self._open = _Commit()
+        self._waiting: deque[_Commit] = deque()
+        self._waiting_bytes = 0
         self._commits = 0
         self._reported = 0
         self._last_s = 0.0
@@ -188,59 +209,48 @@ class Writer:
         self.lost = 0
         self.fault: str | None = None
 
+    @property
+    def waiting(self) -> int:
+        """Return how many rows the disk has not taken."""
+        return sum(each.rows for each in self._waiting)
+
     def write(self, sequence: int, item: Item) -> None:
         """Take one row into the open second."""
         try:
-            self._begin()
             self._take(sequence, item)
             if self._block.is_full:
                 self._flush()
-        except _FAILURES as error:
-            self._fail(error, rows=1)
+        except _REFUSALS as error:
+            self._fail(error, lost=1)
 
     def commit(self, *, lost_before: int, coverage: Coverage | None = None) -> None:
-        """Make the open second last; `lost_before` rows never reached this thread."""
+        """Make the open second last; `lost_before` rows never reached this thread.
+
+        What the disk does not take is tried again with the next commit.
+        """
+        self._flush()
+        if self._waiting_bytes + self._open.size_bytes > HELD_BYTES_MAX:
+            self._forget_open()
+        self._hold(lost_before)
         try:
-            lost = self.lost + lost_before
-            self._report(lost)
-            self._flush()
-            if self.valves.from_orders and not self._told_orders:
-                self._begin()
-                self._connection.execute(SET_META, _FROM_ORDERS)
-                self._told_orders = True
-            if coverage is not None and coverage is not self._coverage:
-                self._begin()
-                write_coverage(self._connection, coverage, self._coverage)
-            if self._connection.in_transaction:
-                self._connection.execute("COMMIT")
-                self._coverage = coverage or self._coverage
-                self.committed += self._pending
-                self._pending = 0
-                self._reported = lost
-                self._commits += 1
-                self.fault = None
-                if self._commits % _CHECKPOINT_EVERY == 0:
-                    self._connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
+            self._save(coverage)
         except _FAILURES as error:
-            self._fail(error, rows=0)
+            self._fail(error)
 
     def finish(self, *, lost_before: int, coverage: Coverage | None = None) -> None:
-        """Make one file of it and mark it closed."""
+        """Make one file of it and mark it closed; a file that lacks what waits stays open."""
         try:
             self._insert_valves(self.valves.end())
-        except _FAILURES as error:
-            self._fail(error, rows=0)
-        self.commit(lost_before=lost_before, coverage=coverage)
-        try:
+            self._keep_simulated()
+            self.commit(lost_before=lost_before, coverage=coverage)
+            # Once more, with what the last commit could not take.
+            self._hold(lost_before)
+            self._save(coverage)
             execute = self._connection.execute
-            self._begin()
+            execute("BEGIN")
             if self._clock.known_s is not None:
                 tell_times_again(self._connection, self._clock.offset_s, self._clock.known_s)
             set_box(self._connection, "applied", self._applied.box)
-            # Once more: the second in which it was first told may be lost.
-            if self.valves.from_orders:
-                execute(SET_META, _FROM_ORDERS)
-            self._keep_simulated()
             execute(SET_META, ("utc_source", self._clock.source))
             execute(SET_META, ("utc_offset_s", repr(self._clock.offset_s)))
             for fact in totals_of(self._connection).items():
@@ -250,40 +260,79 @@ class Writer:
             execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
             execute("PRAGMA journal_mode = DELETE").fetchall()
         except _FAILURES as error:
-            self._fail(error, rows=0)
+            self._fail(error, lost=self.waiting)
         finally:
             self._connection.close()
 
-    def _begin(self) -> None:
-        if not self._connection.in_transaction:
-            self._connection.execute("BEGIN")
-
     def _flush(self) -> None:
-        """Write the open block; where that fails for whatever reason, the second is lost."""
-        if not self._block.row_count:
-            return
-        self._begin()
+        """Pack the open block; where that fails for whatever reason, it is lost."""
+        count = self._block.row_count
         try:
-            self._block.insert(self._connection)
-        except (ValueError, TypeError, OverflowError) as error:
-            raise sqlite3.DataError(f"rows cannot be packed: {error}") from error
-
-    def _fail(self, error: Exception, *, rows: int) -> None:
-        """Count what is gone; SQLite rolls back by itself where it must."""
-        lost = rows
-        if isinstance(error, sqlite3.Error):
-            lost += self._pending
-            self._pending = 0
+            self._block.insert(self._open)
+            self._open.rows += count
+        except _REFUSALS as error:
             self._block = Block()
-            # What was told of the flight in that second is told again; so are the valves' duties.
-            self._told_orders = False
-            self._told_offset_s = math.inf
-            self.valves.forget()
-            if self._connection.in_transaction:
-                self._connection.rollback()
+            self._fail(error, lost=count)
+
+    def _forget_open(self) -> None:
+        """Lose the open second: there is no more memory for what waits."""
+        self.lost += self._open.rows
+        self._open, self._block = _Commit(), Block()
+        # What was told of the flight in that second is told again; so are the valves' duties.
+        self._told_orders = False
+        self._told_offset_s = math.inf
+        self.valves.forget()
+
+    def _hold(self, lost_before: int) -> None:
+        """Put the open second behind those that wait."""
+        if self.valves.from_orders and not self._told_orders:
+            self._open.execute(SET_META, _FROM_ORDERS)
+            self._told_orders = True
+        self._report(self.lost + lost_before)
+        if self._open.statements:
+            self._waiting.append(self._open)
+            self._waiting_bytes += self._open.size_bytes
+            self._open = _Commit()
+
+    def _save(self, coverage: Coverage | None) -> None:
+        """Write all that waits, oldest first; raise what the disk says."""
+        while self._waiting or (coverage is not None and coverage is not self._coverage):
+            now = list(islice(self._waiting, _AT_ONCE))
+            self._connection.execute("BEGIN")
+            lost = sum(map(self._written_but, now))
+            if coverage is not None and coverage is not self._coverage:
+                write_coverage(self._connection, coverage, self._coverage)
+            self._connection.execute("COMMIT")
+            self._coverage = coverage or self._coverage
+            for done in now:
+                self._waiting.popleft()
+                self._waiting_bytes -= done.size_bytes
+                self.committed += done.rows
+            self.committed -= lost
+            self.lost += lost
+            self._commits += 1
+            if self._commits % _CHECKPOINT_EVERY == 0:
+                self._connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
+        self.fault = None
+
+    def _written_but(self, commit: _Commit) -> int:
+        """Write what was taken for a commit; return how many rows the database refused."""
+        lost = 0
+        for sql, values, rows in commit.statements:
+            try:
+                self._connection.execute(sql, values)
+            except _REFUSALS as error:
+                lost += rows
+                _logger.warning("journal: a row is lost: %s", one_line(error))
+        return lost
+
+    def _fail(self, error: Exception, *, lost: int = 0) -> None:
+        """Note why the disk takes nothing, or what is gone for good."""
+        if self._connection.in_transaction:
+            self._connection.rollback()
         self.lost += lost
         if self.fault is None:
-            _logger.warning("journal: %s; %d rows lost", error, lost)
+            _logger.warning("journal: %s; %d rows lost, %d wait", error, lost, self.waiting)
         self.fault = str(error)
 
     def _report(self, lost: int) -> None:
@@ -292,21 +341,20 @@ class Writer:
         text = f"{lost - self._reported} rows lost, {lost} in all"
         if self.fault:
             text += f": {self.fault}"
-        self._begin()
+        self._reported = lost
         self._insert_event(
             self._next_sequence(), Event(at_s=self._last_s, kind="rows-lost", text=text)
         )
-        self._connection.execute(SET_META, ("lost", str(lost)))
+        self._open.execute(SET_META, ("lost", str(lost)))
 
     def _take(self, sequence: int, item: Item) -> None:
         if isinstance(item, ValveOrder):
             self._insert_valves(self.valves.take_order(item))
         elif isinstance(item, LinkSample):
             values = (item.values.get(name) for name in LINK_COLUMNS)
-            self._connection.execute(_LINK, (item.at_s, *values))
+            self._open.execute(_LINK, (item.at_s, *values))
         elif isinstance(item, Event):
-            self._insert_event(sequence, item)
-            self._pending += 1
+            self._insert_event(sequence, item, rows=1)
             if item.kind == SIMULATED:
                 self._simulated = parsed(item.text)
                 self._keep_simulated()
@@ -314,7 +362,7 @@ class Writer:
             body = encode(item)
             row = self._applied.take(sequence, item)
             if row is not None:
-                self._connection.execute(_APPLIED, row)
+                self._open.execute(_APPLIED, row)
             self._insert_valves(self.valves.take_plan(item.plan))
             self._add(sequence, item.now_s, body)
         else:
@@ -327,41 +375,36 @@ class Writer:
     def _add(self, sequence: int, at_s: float, body: str) -> None:
         self._block.add(sequence, at_s, body)
         self._last_s = at_s
-        self._pending += 1
 
     def _insert_valves(self, rows: list[Row]) -> None:
-        if rows:
-            self._begin()
-            self._connection.executemany(_VALVE, rows)
+        for row in rows:
+            self._open.execute(_VALVE, row)
 
-    def _insert_event(self, sequence: int, event: Event) -> None:
+    def _insert_event(self, sequence: int, event: Event, *, rows: int = 0) -> None:
         time = self._clock.text(event.at_s)
-        self._connection.execute(_EVENT, (sequence, time, event.at_s, event.kind, event.text))
+        self._open.execute(_EVENT, (sequence, time, event.at_s, event.kind, event.text), rows)
 
     def _keep_simulated(self) -> None:
         """Keep in `meta` whether the flight is simulated; at the end once more."""
         if self._simulated is not None:
-            self._begin()
-            self._connection.execute(SET_META, (SIMULATED, self._simulated.word))
-            self._connection.execute(SET_META, (BECAUSE, self._simulated.because))
+            self._open.execute(SET_META, (SIMULATED, self._simulated.word))
+            self._open.execute(SET_META, (BECAUSE, self._simulated.because))
 
     def _keep_declared(self, report: DeclarationReport) -> None:
         """Keep in `meta` what the operator declared, and when: the record is made of it."""
         self._declared = [*self._declared, (report.received_s, report.said)][-DECLARED_MAX:]
-        self._begin()
-        self._connection.execute(SET_META, (DECLARED_META, json.dumps(self._declared)))
+        self._open.execute(SET_META, (DECLARED_META, json.dumps(self._declared)))
 
     def _take_time(self, report: UtcReport) -> None:
         """Keep the autopilot's time of day in `meta`; a jump is an event."""
         said = self._clock.take(report)
         if said is not None:
             event = Event(at_s=report.received_s, kind="clock", text=said)
-            self._insert_event(self._next_sequence(), event)
-            self._pending += 1
+            self._insert_event(self._next_sequence(), event, rows=1)
         if said is not None or abs(self._clock.offset_s - self._told_offset_s) > 0.01:
             self._told_offset_s = self._clock.offset_s
-            self._connection.execute(SET_META, ("utc_source", self._clock.source))
-            self._connection.execute(SET_META, ("utc_offset_s", repr(self._clock.offset_s)))
+            self._open.execute(SET_META, ("utc_source", self._clock.source))
+            self._open.execute(SET_META, ("utc_offset_s", repr(self._clock.offset_s)))
 
 
 def tell_times_again(connection: sqlite3.Connection, offset_s: float, known_s: float) -> None:

@@ -1,10 +1,11 @@
-"""The journal's figures: `python -m tests.bench.journal [kills|torn|hour|rate] [--count N]`.
+"""The journal's figures: `python -m tests.bench.journal [kills|torn|hour|rate|held] [--count N]`.
 
 `kills`: a real process that writes is killed (SIGKILL) at random moments; every row that it had
 reported as committed must be there. `torn`: the log that a crash leaves is cut off or garbled at
 random; every transaction before the damage must be there. `hour`: an hour at fifty decisions a
 second, a commit a simulated second: size, and what the writer takes. `rate`: the same at its real
-pace, with and without the journal: what a turn of the control loop takes.
+pace, with and without the journal: what a turn of the control loop takes. `held`: a quarter of an
+hour on a full disk, all valves open: what it takes of the memory, and of time once there is room.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import argparse
 import json
 import os
 import random
+import resource
 import select
 import shutil
 import signal
@@ -292,6 +294,34 @@ def hour(minutes: float, *, seed: int = 1, say: Callable[[str], None] = _say) ->
         return result
 
 
+def held(minutes: float, *, seed: int = 1) -> dict[str, Any]:
+    """Write to a disk that is full, then make room."""
+    setup = open_setup()
+    with tempfile.TemporaryDirectory() as folder:
+        with Journal.create(Path(folder) / "live", setup=setup, started_s=START_S) as journal:
+            pass
+        drive, flight = Second(journal.path, setup), Flight(setup, seed=seed)
+        drive.connection.execute("PRAGMA max_page_count = 1").fetchall()
+        before_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        for second in range(round(60 * minutes)):
+            drive.write([flight.turn(50 * second + number) for number in range(50)])
+        waiting, memory = drive.writer.waiting, drive.writer._waiting_bytes
+        after_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        drive.connection.execute("PRAGMA max_page_count = 1000000000").fetchall()
+        busy_s = time.process_time()
+        drive.writer.commit(lost_before=0)
+        busy_s = time.process_time() - busy_s
+        drive.writer.finish(lost_before=0)
+        assert read_journal(journal.path).lost == drive.writer.lost == 0
+        return {
+            "minutes": minutes,
+            "rows": waiting,
+            "counted_mb": memory / 1e6,
+            "process_grew_mb": (after_kb - before_kb) / 1e3,
+            "written_cpu_s": busy_s,
+        }
+
+
 def _tables(path: Path, hours: float) -> dict[str, float]:
     connection = sqlite3.connect(path)
     try:
@@ -371,6 +401,7 @@ def main() -> None:
         "torn": lambda: torn(asked.count, seed=asked.seed),
         "hour": lambda: hour(asked.minutes, seed=asked.seed),
         "rate": lambda: rate(asked.seconds, seed=asked.seed),
+        "held": lambda: held(min(asked.minutes, 15.0), seed=asked.seed),
     }
     found = {name: parts[name]() for name in asked.what}
     sys.stdout.write(f"{json.dumps(found, indent=1)}\n")

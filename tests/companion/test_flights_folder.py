@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,6 @@ import pytest
 
 from companion.cli.app import execute
 from companion.cli.record_parts import made_ready
-from companion.config.tables import JournalTable
 from companion.errors import JournalError
 from companion.journal.folder import (
     Flight,
@@ -279,12 +279,20 @@ def test_wrong_places_are_refused_in_one_line(
 # --------------------------------------------------------------------------------- before a flight
 
 
-def test_before_a_flight_old_ones_are_recovered_and_pruned(folder: Path) -> None:
+def test_before_a_flight_what_a_crash_left_is_recovered_and_nothing_is_removed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However little room there is: the law may want a record kept that nobody has exported."""
+    for number in range(4, 30):
+        shutil.copy(folder / "flight-0001.gpkg", folder / f"flight-{number:04d}.gpkg")
+    before = [path.name for path in journals(folder)]
     change(folder / "flight-0002.gpkg", "UPDATE meta SET value = 'no' WHERE key = 'closed'")
-    lines = list(made_ready(folder, JournalTable(keep_count=1, keep_free_percent=0.0)))
-    assert lines[0].startswith("journal: flight-0002.gpkg: recovered")
-    assert [line.split(": ")[1] for line in lines[1:3]] == ["flight-0001.gpkg", "flight-0002.gpkg"]
-    assert [path.name for path in journals(folder)] == ["flight-0003.gpkg"]
+    short = Space(total_bytes=10**10, free_bytes=5 * 10**8)
+    monkeypatch.setattr("companion.journal.folder.space_of", lambda _folder: short)
+    recovered, room = made_ready(folder)
+    assert recovered.startswith("journal: flight-0002.gpkg: recovered")
+    assert "only 5 % of the disk is free" in room and "vrspray flights prune" in room
+    assert [path.name for path in journals(folder)] == before
 
 
 def test_a_full_disk_is_refused_before_the_flight(
@@ -292,5 +300,5 @@ def test_a_full_disk_is_refused_before_the_flight(
 ) -> None:
     full = Space(total_bytes=10**12, free_bytes=10**6)
     monkeypatch.setattr("companion.journal.folder.space_of", lambda _folder: full)
-    with pytest.raises(JournalError, match="only 1 MB are free"):
-        list(made_ready(folder, JournalTable()))
+    with pytest.raises(JournalError, match="only 1 MB are free, a flight"):
+        list(made_ready(folder))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import shutil
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import textwrap
 import threading
+from contextlib import closing
 from itertools import count
 from pathlib import Path
 from typing import cast, get_args
@@ -54,8 +56,10 @@ from companion.core.types import (
     WindReport,
 )
 from companion.errors import JournalError
+from companion.journal import writer as writer_module
 from companion.journal.codec import decode, encode
 from companion.journal.journal import Journal, open_for_flight
+from companion.journal.rows import ValveOrder
 from companion.journal.writer import Event, Writer
 from tests.builders import flying, setup
 from tests.companion.journal_edit import with_body
@@ -368,31 +372,73 @@ def test_after_the_end_nothing_is_taken_and_nothing_is_raised(tmp_path: Path) ->
     assert read_journal(journal.path).entries == ()
 
 
-def test_a_full_disk_costs_rows_and_the_record_goes_on_when_there_is_room(tmp_path: Path) -> None:
-    path = closed_journal(tmp_path, 0)
+def full(path: Path) -> tuple[Writer, sqlite3.Connection]:
+    """Return a writer whose database has room for three pages more."""
     writer, connection = writer_on(path)
+    connection.execute("UPDATE meta SET value = 'no' WHERE key = 'closed'")
     (pages,) = connection.execute("PRAGMA page_count").fetchone()
     connection.execute(f"PRAGMA max_page_count = {pages + 3}").fetchall()
+    return writer, connection
+
+
+def test_a_full_disk_costs_nothing_once_there_is_room_again(tmp_path: Path) -> None:
+    path = closed_journal(tmp_path, 0)
+    writer, connection = full(path)
+    writer.valves.from_orders = True
     made = decisions(400)
     faults = set()
     for sequence, decision in enumerate(made, 1):
         writer.write(sequence, decision)
-        faults.add(writer.fault)
-    assert writer.lost > 100
+        writer.write(0, ValveOrder(valve=0, duty=sequence / 1000, planned_s=None, given_s=1.0))
+        if sequence % 5 == 0:
+            writer.commit(lost_before=0)
+            faults.add(writer.fault)
     assert "database or disk is full" in faults
-    writer.commit(lost_before=0)
+    assert writer.waiting > 300 and writer.waiting + writer.committed == 400
     connection.execute("PRAGMA max_page_count = 1000000").fetchall()
-    writer.write(401, made[-1])
     writer.commit(lost_before=0)
-    assert writer.fault is None
+    assert (writer.fault, writer.waiting, writer.committed) == (None, 0, 400)
     writer.finish(lost_before=0)
     content = read_journal(path)
-    assert encode(made[-1]) == content.entries[-1].body
+    assert texts(content.items()) == texts(made)
+    assert content.lost == writer.lost == 0
+    with closing(sqlite3.connect(path)) as reader:
+        assert reader.execute("SELECT count(*) FROM valve_changes").fetchone() == (400,)
+
+
+def test_memory_for_what_waits_has_an_end_and_what_follows_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writer_module, "HELD_BYTES_MAX", 30_000)
+    path = closed_journal(tmp_path, 0)
+    writer, connection = full(path)
+    made = decisions(400)
+    for sequence, decision in enumerate(made, 1):
+        if sequence == 300:
+            connection.execute("PRAGMA max_page_count = 1000000").fetchall()
+        writer.write(sequence, decision)
+        if sequence % 5 == 0:
+            writer.commit(lost_before=0)
+            assert writer._waiting_bytes < 60_000
+    writer.finish(lost_before=0)
+    content = read_journal(path)
+    assert 100 < content.lost == writer.lost == 400 - len(content.entries)
+    assert content.entries[-1].body == encode(made[-1])
     assert any("disk is full" in event.text for event in content.events)
-    assert content.lost == writer.lost == 401 - len(content.entries)
 
 
-def test_a_row_that_the_database_refuses_costs_its_second_and_no_more(tmp_path: Path) -> None:
+def test_a_flight_that_ends_on_a_full_disk_is_not_called_closed(tmp_path: Path) -> None:
+    path = closed_journal(tmp_path, 0)
+    writer, _ = full(path)
+    for sequence, decision in enumerate(decisions(400), 1):
+        writer.write(sequence, decision)
+    writer.finish(lost_before=0)
+    assert writer.lost == 400
+    content = read_journal(path)
+    assert not content.is_closed and content.entries == ()
+
+
+def test_a_row_that_the_database_refuses_costs_itself_and_no_more(tmp_path: Path) -> None:
     path = closed_journal(tmp_path, 0)
     writer, _ = writer_on(path)
     writer.write(1, INPUTS[1])
@@ -401,8 +447,66 @@ def test_a_row_that_the_database_refuses_costs_its_second_and_no_more(tmp_path: 
     writer.write(3, INPUTS[3])
     writer.commit(lost_before=0)
     writer.finish(lost_before=0)
-    assert (writer.lost, writer.committed) == (3, 1)
-    assert texts(read_journal(path).items()) == texts([INPUTS[3]])
+    assert (writer.lost, writer.committed) == (1, 3)
+    assert texts(read_journal(path).items()) == texts([INPUTS[1], INPUTS[3]])
+
+
+# A small disk of its own, which something else fills, and frees again while the flight goes on.
+DISK = """
+import json, sys, time
+from pathlib import Path
+from companion.journal.journal import Journal
+from tests.builders import setup
+from tests.companion.test_journal import decisions
+
+disk, made, told = Path(sys.argv[1]), decisions(600), []
+frees_at_end = sys.argv[2] == "end"
+with Journal.create(disk, setup=setup(), commit_every_s=0.1) as journal:
+    with (disk / "other").open("wb", buffering=0) as other:
+        try:
+            while True:
+                other.write(bytes(4096))
+        except OSError as error:
+            told.append(error.errno)
+    for number, decision in enumerate(made):
+        journal.record_decision(decision)
+        if number % 10 == 0:
+            time.sleep(0.02)
+    until_s = time.monotonic() + 60
+    while journal.fault is None and time.monotonic() < until_s:
+        time.sleep(0.01)
+    time.sleep(0.6)
+    told += [journal.fault, journal.lost, journal.saved_age_s > 0.5]
+    if frees_at_end:
+        import threading
+        threading.Timer(0.5, (disk / "other").unlink).start()
+    else:
+        (disk / "other").unlink()
+        while journal.committed < 600 and time.monotonic() < until_s:
+            time.sleep(0.01)
+        told += [journal.fault, journal.saved_age_s < 30.0]
+from analysis.journals.content import read_journal
+content = read_journal(journal.path)
+print(json.dumps([*told, content.is_closed, content.lost, len(content.entries)]))
+"""
+
+
+@pytest.mark.parametrize("freed", ["in-flight", "end"])
+def test_a_disk_that_was_full_for_a_while_has_the_whole_flight(tmp_path: Path, freed: str) -> None:
+    own = ["unshare", "--mount", *([] if os.geteuid() == 0 else ["--map-root-user"])]
+    script = 'mount -t tmpfs -o size=900k none "$1" && exec "$2" -c "$3" "$1" "$4"'
+    given = [str(tmp_path), sys.executable, DISK, freed]
+    try:
+        done = subprocess.run(
+            [*own, "sh", "-c", script, "sh", *given], cwd=ROOT, capture_output=True, timeout=50
+        )
+    except FileNotFoundError:
+        pytest.skip("no unshare on this computer")
+    if b"unshare" in done.stderr or b"mount:" in done.stderr:
+        pytest.skip("no disk of its own for this user")
+    told = json.loads(done.stdout)
+    assert told[:4] == [28, "database or disk is full", 0, True]
+    assert told[4:] == [*([None, True] if freed == "in-flight" else []), True, 0, 600]
 
 
 # ------------------------------------------------------------------------- cut off, broken, alien

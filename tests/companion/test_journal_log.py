@@ -14,7 +14,6 @@ from analysis.journals.content import read_journal
 from analysis.journals.salvage import recover, recover_folder
 from companion.cli.app import execute
 from companion.cli.record_parts import made_ready
-from companion.config.tables import JournalTable
 from companion.journal.geopackage import PAGE_BYTES
 from companion.journal.journal import open_for_flight
 from companion.journal.log import EVENT_KIND, META_KEY, log_damage, log_from
@@ -156,7 +155,7 @@ def test_what_is_lost_behind_damage_is_said(
 def test_what_is_lost_is_said_before_the_next_flight_too(left: Path, ends: list[int]) -> None:
     damage, _, lost_s = DAMAGED["a hole"]
     log = damaged(left, ends, damage)
-    lines = list(made_ready(left.parent, JournalTable()))
+    lines = list(made_ready(left.parent))
     (line,) = (line for line in lines if left.name in line)
     assert "recovered: the log is damaged at byte " in line
     assert f"at most about {lost_s} s, is lost" in line

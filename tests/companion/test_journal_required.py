@@ -1,4 +1,4 @@
-"""Without its record a flight does not begin to spray; one that has begun goes on."""
+"""Without its record a flight does not begin to spray; one that has begun goes on for a while."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ STEPS = 60
 
 @dataclass
 class Flight:
-    """A flight over the plots through the control loop; `fault` is the recorder's."""
+    """A flight over the plots through the control loop; `fault` and age are the recorder's."""
 
     fault: str | None = None
+    saved_age_s: float = 0.5
     now_s: float = 100.0
     told: list[str] = field(default_factory=list)
 
@@ -42,7 +43,7 @@ class Flight:
             recorder=NoRecorder(),
             clock=lambda: self.now_s,
             boot_clock=lambda: self.now_s,
-            record_fault=lambda: self.fault,
+            required=(self, 60.0),
         )
         self._chance = random.Random(7)
         self._number = 0
@@ -88,6 +89,25 @@ def test_a_flight_that_has_begun_goes_on_without_its_record() -> None:
     later = flight.fly(20)
     assert is_spraying(later)
     assert not any(Inhibit.OUTPUT_FAULT in decision.inhibits for decision in later)
+
+
+def test_in_flight_what_lasts_closes_and_both_are_told_once() -> None:
+    flight = Flight()
+    assert is_spraying(flight.fly(60))
+    flight.fault, flight.saved_age_s = "database or disk is full", 59.9
+    assert is_spraying(flight.fly(20))
+    (told,) = flight.told
+    assert told.startswith("journal: database or disk is full") and "after 60 s" in told
+    flight.saved_age_s = 60.1
+    later = flight.fly(20)
+    assert all(Inhibit.OUTPUT_FAULT in decision.inhibits for decision in later)
+    assert not any(decision.plan.opens for decision in later)
+    assert flight.told[1:] == ["journal: database or disk is full"]
+    # It ends with the fault, and somebody has to answer first: no valve opens by itself.
+    flight.fault, flight.saved_age_s = None, 0.5
+    again = flight.fly(20)
+    assert Inhibit.OUTPUT_FAULT not in again[-1].inhibits
+    assert again[-1].sprayer is SprayerState.FAULT
 
 
 def test_after_the_landing_the_record_counts_again() -> None:
