@@ -7,13 +7,16 @@ that flies a zig-zag backwards keeps its boom, and its left valve stays on its l
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache, partial
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
+from companion.core.arithmetic import log
 from companion.core.braking import CREEP_M_S, braking_begins_s
 from companion.core.frame import Box, Floats, Offset, PlainEdge
 from companion.core.motion import Turning, gained_s
@@ -119,9 +122,79 @@ STRAIGHT_YAW_RATE_DEG_S = 3.0
 STRAIGHT_LATERAL_M_S2 = 1.0
 # From here on each valve is dosed by a speed of its own.
 STEADY_YAW_RATE_DEG_S = 1.0
-CURVE_CHORDS = 6
 # Knots of a path nearer than this are one.
 KNOTS_APART_S = 1e-3
+# In a turn a chord is so long, or this share of how far ahead it begins; leads nearer than
+# `LEADS_APART_S` share a knot.
+CURVE_CHORD_S, CURVE_CHORD_SHARE, LEADS_APART_S = 0.09, 0.6, 0.02
+# A way is known to this when it is turned into a time.
+WAY_SD_M, WAY_ROUNDS = 1e-6, 16
+
+
+class Fading(NamedTuple):
+    """How a straight chord is flown while an acceleration fades: to the metre, at every time.
+
+    `behind_m` is how far back it begins, `goes_m_s` how fast the place goes now, `speed_m_s` the
+    speed that is dosed by.
+    """
+
+    now_s: float
+    behind_m: float
+    goes_m_s: float
+    speed_m_s: float
+    gain_m_s2: float
+    fade_s: float
+
+    def at(self, way_m: float) -> tuple[float, float]:
+        """Return when the path is so far along the chord, and its speed there.
+
+        By Newton's method, from the time without a gain: it comes nearer from one side only.
+        """
+        way_m -= self.behind_m
+        dt_s = way_m / self.goes_m_s
+        if not dt_s > 0.0:  # into the past it goes at constant velocity
+            return self.now_s + dt_s, self.speed_m_s
+        gain, fade_s = self.gain_m_s2, self.fade_s
+        gained = gained_s(dt_s, fade_s)
+        for _ in range(WAY_ROUNDS):
+            off_m = self.goes_m_s * dt_s + gain * fade_s * (dt_s - gained) - way_m
+            if abs(off_m) <= WAY_SD_M:
+                break
+            dt_s -= off_m / (self.goes_m_s + gain * gained)
+            gained = gained_s(dt_s, fade_s)
+        return self.now_s + dt_s, self.speed_m_s + gain * gained
+
+    def speed_at(self, at_s: float) -> float:
+        """Return the speed at a time."""
+        return self.speed_m_s + self.gain_m_s2 * gained_s(max(at_s - self.now_s, 0.0), self.fade_s)
+
+
+class Chord(NamedTuple):
+    """When a chord of a point's path begins and ends, how fast then, and how long it is.
+
+    Its speed changes evenly: s = v0 t + (v1 - v0) t^2 / 2T, scaled to its end; or as `fading` says.
+    """
+
+    times_s: Sequence[float]
+    speeds_m_s: Sequence[float]
+    length_m: float
+    fading: Fading | None = None
+
+    def at(self, share: float) -> tuple[float, float]:
+        """Return when the path is at a share of it, and how fast."""
+        if self.fading is not None:
+            return self.fading.at(share * self.length_m)
+        (t0, t1), (v0, v1) = self.times_s, self.speeds_m_s
+        v0_2 = v0 * v0
+        speed = math.sqrt(v0_2 + (v1 * v1 - v0_2) * share)
+        return t0 + share * (v0 + v1) / max(v0 + speed, 1e-9) * (t1 - t0), speed
+
+    def speed_at(self, at_s: float) -> float:
+        """Return the speed at a time."""
+        if self.fading is not None:
+            return self.fading.speed_at(at_s)
+        (t0, t1), (v0, v1) = self.times_s, self.speeds_m_s
+        return v0 + (at_s - t0) / (t1 - t0) * (v1 - v0)
 
 
 class Pass(NamedTuple):
@@ -131,15 +204,18 @@ class Pass(NamedTuple):
     itself it lies (way east x north - way north x east).
     """
 
-    time_s: tuple[float, float]
-    speed_m_s: tuple[float, float]
+    chord: Chord
     middle: tuple[tuple[float, float], tuple[float, float]]
     right: tuple[float, float]
     points: list[tuple[float, float, float, float, float, float]]
 
 
 class Paths(NamedTuple):
-    """Predicted paths of points of the boom: (points, knots) arrays, knots at `time_s`."""
+    """Predicted paths of points of the boom: (points, knots) arrays, knots at `time_s`.
+
+    `right` is where the boom points in the middle of each chord, and `off_m` (points, chords) how
+    far the true arc is from the chord at most; `turned` the sine of half the chord's turn.
+    """
 
     time_s: tuple[float, ...]
     east_m: Floats
@@ -150,11 +226,24 @@ class Paths(NamedTuple):
     step_east_m: Floats
     step_north_m: Floats
     length_m: Floats
+    off_m: Floats | None = None
+    turned: tuple[float, ...] = ()
+    fading: Fading | None = None  # of the first chord of a straight path
 
-    def chord_of(self, point: int, chord: int) -> tuple[Sequence[float], Sequence[float]]:
-        """Return when a chord of a point's path begins and ends, and how fast it is then."""
+    def chord_of(self, point: int, chord: int) -> Chord:
+        """Return how a chord of a point's path is flown."""
         both = slice(chord, chord + 2)
-        return self.time_s[both], self.speed_m_s[point, both].tolist()
+        return Chord(
+            self.time_s[both],
+            self.speed_m_s[point, both].tolist(),
+            self.length_m.item(point, chord),
+            self.fading if not chord else None,
+        )
+
+    def speed_at(self, point: int, at_s: float) -> float:
+        """Return how fast a point is at a time."""
+        chord = min(max(bisect_right(self.time_s, at_s) - 1, 0), len(self.time_s) - 2)
+        return self.chord_of(point, chord).speed_at(at_s)
 
 
 def box_of(middle: tuple[tuple[float, float], ...], reach_m: float) -> Box:
@@ -178,58 +267,122 @@ def straight_pass(state: VehicleState, boom: Boom, *, back_s: float, ahead_s: fl
         dx, dy = (east + e1) - px, (north + n1) - py
         # The length as numpy has it, by the C library; `math.hypot` rounds otherwise.
         points.append((px, py, dx, dy, abs(complex(dx, dy)), dx * py - dy * px))
-    times_s = (state.time_s + begin_s, state.time_s + end_s)
-    speeds_m_s = (math.hypot(*motions[0][1:3]), math.hypot(*motions[1][1:3]))
-    return Pass(times_s, speeds_m_s, ((e0, n0), (e1, n1)), (cos, -sin), points)
+    chord = Chord(
+        (state.time_s + begin_s, state.time_s + end_s),
+        (math.hypot(*motions[0][1:3]), math.hypot(*motions[1][1:3])),
+        points[0][4],
+        _fading(state, back_s),
+    )
+    return Pass(chord, ((e0, n0), (e1, n1)), (cos, -sin), points)
 
 
 def predict(
-    state: VehicleState, right_m: Floats, forward_m: Floats, *, back_s: float, ahead_s: float
+    state: VehicleState,
+    right_m: Floats,
+    forward_m: Floats,
+    *,
+    back_s: float,
+    ahead_s: float,
+    leads_s: tuple[float, ...] = (),
 ) -> Paths:
     """Return the paths of points of the boom from `back_s` ago to `ahead_s` from now.
 
     The same motion as `estimator.estimate`: constant velocity plus a fading acceleration, in the
-    turn of the nose as well; on a straight path that ends in a stop, the braking before it.
+    turn of the nose as well; on a straight path that ends in a stop, the braking before it. It is
+    exact at all times on a straight path; in a turn now, and at each of the `leads_s`.
     """
     heading_deg = state.heading_deg if state.heading_deg is not None else 0.0
-    yaw = turning_of(state)
     motions = _motions(state, back_s, ahead_s)
-    turning = motions is None
     if motions is None:
-        whole_s = back_s + ahead_s
-        knots = [-back_s + whole_s * i / CURVE_CHORDS for i in range(CURVE_CHORDS + 1)]
-        shape = (len(right_m), CURVE_CHORDS + 1)
-        east, north, pace = np.empty(shape), np.empty(shape), np.empty(shape)
-        middle = [
-            _knot(state, dt_s, heading_deg, right_m, forward_m, (east, north, pace), i)
-            for i, dt_s in enumerate(knots)
-        ]
-    else:
-        knots = [motion[0] for motion in motions]
-        middle = [(motion[3], motion[4]) for motion in motions]
-        aside = np.array(_offsets(heading_deg, right_m, forward_m))
-        east = aside[:, :1] + np.array([place[0] for place in middle])
-        north = aside[:, 1:] + np.array([place[1] for place in middle])
-        pace = np.empty(east.shape)
-        pace[:] = [math.hypot(motion[1], motion[2]) for motion in motions]
-    rights = []
-    for a, b in pairwise(knots):
-        turned_deg = yaw.after((a + b) / 2)[0] if turning else 0.0
-        angle = math.radians(heading_deg + turned_deg)
-        rights.append((math.cos(angle), -math.sin(angle)))
-    dx = east[:, 1:] - east[:, :-1]
-    dy = north[:, 1:] - north[:, :-1]
+        return _curved(state, heading_deg, right_m, forward_m, _knots(back_s, ahead_s, leads_s))
+    middle = [(motion[3], motion[4]) for motion in motions]
+    aside = np.array(_offsets(heading_deg, right_m, forward_m))
+    east = aside[:, :1] + np.array([place[0] for place in middle])
+    north = aside[:, 1:] + np.array([place[1] for place in middle])
+    pace = np.empty(east.shape)
+    pace[:] = [math.hypot(motion[1], motion[2]) for motion in motions]
+    angle = math.radians(heading_deg)
+    dx, dy = east[:, 1:] - east[:, :-1], north[:, 1:] - north[:, :-1]
     return Paths(
-        time_s=tuple([state.time_s + dt_s for dt_s in knots]),
+        time_s=tuple([state.time_s + motion[0] for motion in motions]),
         east_m=east,
         north_m=north,
         speed_m_s=pace,
         middle=tuple(middle),
-        right=tuple(rights),
+        right=((math.cos(angle), -math.sin(angle)),) * (len(motions) - 1),
         step_east_m=dx,
         step_north_m=dy,
         length_m=np.hypot(dx, dy),
+        fading=_fading(state, back_s),
     )
+
+
+@lru_cache(maxsize=8)
+def _knots(back_s: float, ahead_s: float, leads_s: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the knots of a path in a turn: now, at each lead, and the denser the sooner.
+
+    >>> [round(at_s, 2) for at_s in _knots(0.2, 1.0, (0.12, 0.13))]
+    [-0.2, 0.0, 0.06, 0.12, 0.2, 0.29, 0.45, 0.72, 1.0]
+    """
+    found = [-back_s, 0.0]
+    for due_s in (*sorted(lead_s for lead_s in leads_s if lead_s < ahead_s), ahead_s):
+        if not due_s - found[-1] >= LEADS_APART_S:
+            continue
+        while due_s - found[-1] > (most_s := max(CURVE_CHORD_S, CURVE_CHORD_SHARE * found[-1])):
+            left_s = due_s - found[-1]
+            found.append(found[-1] + (most_s if left_s >= 2.0 * most_s else 0.5 * left_s))
+        found.append(due_s)
+    return (*found[:-1], ahead_s)
+
+
+def _curved(
+    state: VehicleState,
+    heading_deg: float,
+    right_m: Floats,
+    forward_m: Floats,
+    knots: tuple[float, ...],
+) -> Paths:
+    """Return the paths of points of the boom in a turn; what they leave out is told with them."""
+    ae, an = state.acceleration_east_m_s2, state.acceleration_north_m_s2
+    moved = np.array([_carried(state, dt_s, ae, an) for dt_s in knots]).T
+    turns = [_turned(state, dt_s) for dt_s in knots]
+    nose = [math.radians(heading_deg + turned_deg) for turned_deg, _ in turns]
+    yaw_rate = np.radians([rate_deg_s for _, rate_deg_s in turns])
+    # Not numpy's own, which rounds as the processor has it.
+    sin, cos = np.array(list(map(math.sin, nose))), np.array(list(map(math.cos, nose)))
+    right, forward = right_m[:, None], forward_m[:, None]
+    offset_east, offset_north = right * cos + forward * sin, forward * cos - right * sin
+    velocity_east, velocity_north = (
+        moved[0] + yaw_rate * offset_north,
+        moved[1] - yaw_rate * offset_east,
+    )
+    east, north = moved[2] + offset_east, moved[3] + offset_north
+    dx, dy = east[:, 1:] - east[:, :-1], north[:, 1:] - north[:, :-1]
+    # Of an even change of velocity over a chord the arc is off by an eighth of it.
+    bent = np.hypot(np.diff(velocity_east, axis=1), np.diff(velocity_north, axis=1))
+    middles = [0.5 * (a + b) for a, b in pairwise(nose)]
+    return Paths(
+        time_s=tuple([state.time_s + dt_s for dt_s in knots]),
+        east_m=east,
+        north_m=north,
+        speed_m_s=np.hypot(velocity_east, velocity_north),
+        middle=tuple(zip(moved[2].tolist(), moved[3].tolist(), strict=True)),
+        right=tuple([(math.cos(angle), -math.sin(angle)) for angle in middles]),
+        step_east_m=dx,
+        step_north_m=dy,
+        length_m=np.hypot(dx, dy),
+        off_m=bent * np.diff(knots) / 8.0,
+        turned=tuple([math.sin(min(0.5 * abs(b - a), 0.5 * math.pi)) for a, b in pairwise(nose)]),
+    )
+
+
+def _turned(state: VehicleState, dt_s: float) -> tuple[float, float]:
+    """Return how far the nose turns in a time [deg], and how fast then; steadily in the past."""
+    turning = turning_of(state)
+    if not dt_s > 0.0:
+        return turning.rate_deg_s * dt_s, turning.rate_deg_s
+    turned_deg, then = turning.after(dt_s)
+    return turned_deg, then.rate_deg_s
 
 
 def turning_of(state: VehicleState) -> Turning:
@@ -295,15 +448,30 @@ _Motion = tuple[float, float, float, float, float]
 
 
 def _along(state: VehicleState) -> tuple[float, float]:
-    """Return the acceleration along the course, all that counts on a straight path.
+    """Return the acceleration along the way, all that counts on a straight path.
 
     One chord to where the other leads would miss the near end of the path by more than leaving it
     out.
     """
-    ve, vn = state.velocity_east_m_s, state.velocity_north_m_s
-    gain = ve * state.acceleration_east_m_s2 + vn * state.acceleration_north_m_s2
-    gain /= max(ve * ve + vn * vn, 1e-9)
-    return gain * ve, gain * vn
+    east, north = place_velocity(state)
+    gain = east * state.acceleration_east_m_s2 + north * state.acceleration_north_m_s2
+    gain /= max(east * east + north * north, 1e-9)
+    return gain * east, gain * north
+
+
+def _fading(state: VehicleState, back_s: float) -> Fading | None:
+    """Return how the first chord of a straight path is flown; None at an even speed."""
+    east, north = place_velocity(state)
+    goes_m_s = math.hypot(east, north)
+    if not goes_m_s > CREEP_M_S:
+        return None
+    gain = (east * state.acceleration_east_m_s2 + north * state.acceleration_north_m_s2) / goes_m_s
+    if gain == 0.0:
+        return None
+    speed_m_s = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
+    return Fading(
+        state.time_s, goes_m_s * back_s, goes_m_s, speed_m_s, gain, state.acceleration_fade_s
+    )
 
 
 def _braked(
@@ -350,8 +518,25 @@ def _motions(state: VehicleState, back_s: float, ahead_s: float) -> list[_Motion
         braked = _braked(state, state.stop_ahead, ae, an, back_s, ahead_s)
         if braked is not None:
             return braked
-    ends_s = (-back_s, -back_s + (back_s + ahead_s))
-    return [(dt_s, *_carried(state, dt_s, ae, an)) for dt_s in ends_s]
+    stands_s = _stands_s(state)
+    ends_s = (-back_s, -back_s + (back_s + min(ahead_s, stands_s)))
+    motions = [(dt_s, *_carried(state, dt_s, ae, an)) for dt_s in ends_s]
+    if stands_s < ahead_s:
+        # A path of no length crosses nothing: it creeps on, as behind a stop.
+        _, ve, vn, east_m, north_m = motions[-1]
+        goes_east, goes_north = place_velocity(state)
+        by_s = CREEP_M_S * (ahead_s - stands_s) / math.hypot(goes_east, goes_north)
+        motions.append((ahead_s, ve, vn, east_m + goes_east * by_s, north_m + goes_north * by_s))
+    return motions
+
+
+def _stands_s(state: VehicleState) -> float:
+    """Return when a straight path has all but come to a stand, if its braking goes on."""
+    fading = _fading(state, 0.0)
+    if fading is None or not fading.gain_m_s2 < 0.0:
+        return math.inf
+    share = (fading.goes_m_s - CREEP_M_S) / (-fading.gain_m_s2 * fading.fade_s)
+    return -fading.fade_s * log(1.0 - share) if share < 1.0 else math.inf
 
 
 def _offsets(heading_deg: float, right_m: Floats, forward_m: Floats) -> list[tuple[float, float]]:
@@ -364,54 +549,6 @@ def _offsets(heading_deg: float, right_m: Floats, forward_m: Floats) -> list[tup
     ]
 
 
-def _knot(
-    state: VehicleState,
-    dt_s: float,
-    heading_deg: float,
-    right_m: Floats,
-    forward_m: Floats,
-    into: tuple[Floats, Floats, Floats],
-    column: int,
-) -> tuple[float, float]:
-    """Write east, north and speed of all points at `dt_s` from now into a column, in a turn.
-
-    Returns the position reference itself.
-    """
-    ae, an = state.acceleration_east_m_s2, state.acceleration_north_m_s2
-    velocity_east, velocity_north, middle_east, middle_north = _carried(state, dt_s, ae, an)
-    turned_deg, yaw = turning_of(state).after(dt_s)
-    angle = math.radians(heading_deg + turned_deg)
-    sin, cos = math.sin(angle), math.cos(angle)
-    offset_east = right_m * cos + forward_m * sin
-    offset_north = forward_m * cos - right_m * sin
-    east, north, pace = into
-    east[:, column] = middle_east + offset_east
-    north[:, column] = middle_north + offset_north
-    yaw_rate = math.radians(yaw.rate_deg_s)
-    pace[:, column] = np.hypot(
-        velocity_east + yaw_rate * offset_north, velocity_north - yaw_rate * offset_east
-    )
-    return middle_east, middle_north
-
-
-def time_on_chord(
-    times_s: Sequence[float], speeds_m_s: Sequence[float], s: float, reach: float
-) -> tuple[float, float]:
-    """Return when the path is `s` metres along a chord of that length, and its speed there.
-
-    Speed changes evenly along a chord: s = v0 t + (v1 - v0) t^2 / 2T, scaled to the chord's end
-    (as in `crossings._at`).
-    """
-    (t0, t1), (v0, v1) = times_s, speeds_m_s
-    if not v0 + v1 > 1e-9:
-        return t0, 0.0
-    share = s / reach
-    spread = (v1 * v1 - v0 * v0) * share + v0 * v0
-    speed = math.sqrt(max(spread, 0.0))
-    tau = share * (v0 + v1) / (v0 + speed) if v0 + speed > 0.0 else 0.0
-    return t0 + tau * (t1 - t0), speed
-
-
 # --------------------------------------------------------------------------------------- the border
 
 # Which strip meets which edge, and the least and greatest way along the path where it does.
@@ -421,7 +558,7 @@ Merge = Callable[[list[Contact]], list[Contact]]
 # From when until when a strip is closed.
 Intervals = list[tuple[float, float]]
 
-# A boom that lies nearly along its own motion covers no strip that could be judged.
+# A strip that lies nearly along its own motion is judged by what surrounds it, seen along the way.
 ACROSS_MIN = 0.2
 
 
@@ -438,75 +575,60 @@ def add_contacts(
         return
     chords = len(paths.time_s) - 1
     for chord in range(chords):
-        found = _contacts(paths, chord, ends, widened(boom, buffer_m))
-        times_s = paths.time_s[chord], paths.time_s[chord + 1]
-        speeds = paths.speed_m_s[:, chord : chord + 2].tolist()
-        ways = list(zip(paths.length_m[:, chord].tolist(), speeds, strict=True))
-        _close(found, times_s, ways, buffer_m, closed, merge, is_last=chord == chords - 1)
+        found = _contacts(paths, chord, ends, boom, buffer_m)
+        _close(found, partial(_chord, paths, chord), closed, merge, is_last=chord == chords - 1)
+
+
+def _chord(paths: Paths, chord: int, valve: int) -> Chord:
+    return paths.chord_of(valve, chord)
 
 
 def add_contacts_of_pass(
-    way: Pass,
-    edges: list[PlainEdge],
-    boom: Boom,
-    buffer_m: float,
-    closed: list[Intervals],
+    way: Pass, edges: list[PlainEdge], boom: Boom, buffer_m: float, closed: list[Intervals]
 ) -> None:
     """Add to `closed` when an edge of the border lies within a strip, on a straight pass."""
     if edges:
-        found = _contacts_of_pass(way, edges, widened(boom, buffer_m).tolist())
-        ways = [(point[4], way.speed_m_s) for point in way.points]
-        _close(found, way.time_s, ways, buffer_m, closed, None, is_last=True)
-
-
-def widened(boom: Boom, buffer_m: float) -> Floats:
-    """Return half of each strip's width, with the buffer beside it."""
-    half_m: Floats = boom.half_width_m + buffer_m
-    return half_m
+        found = _contacts_of_pass(way, edges, boom, buffer_m)
+        _close(found, lambda _: way.chord, closed, None, is_last=True)
 
 
 def _close(
-    contacts: list[Contact] | None,
-    times_s: tuple[float, float],
-    ways: Sequence[tuple[float, Sequence[float]]],
-    buffer_m: float,
+    contacts: list[Contact],
+    chord_of: Callable[[int], Chord],
     closed: list[Intervals],
     merge: Merge | None,
     *,
     is_last: bool,
 ) -> None:
-    """Add when the contacts of a chord are; `ways` are each valve's length of it, and its speeds.
-
-    The chord's whole time where the boom lies along its own motion, and nothing can be judged.
-    """
-    if contacts is None:
-        for intervals in closed:
-            intervals.append(times_s)
-        return
-    for valve, _, limits in contacts if merge is None else merge(contacts):
-        first, last = limits[0] - buffer_m, limits[1] + buffer_m
-        reach, speeds_m_s = ways[valve]
+    """Add when the contacts of a chord are; `chord_of` is each valve's."""
+    for valve, _, (first, last) in contacts if merge is None else merge(contacts):
+        chord = chord_of(valve)
+        reach = chord.length_m
         if last < 0.0 or first > reach:
             continue
-        begin = time_on_chord(times_s, speeds_m_s, max(first, 0.0), reach)[0]
-        end = time_on_chord(times_s, speeds_m_s, min(last, reach), reach)[0]
+        begin = chord.at(first / reach)[0] if first > 0.0 else chord.times_s[0]
+        end = chord.at(last / reach)[0] if last < reach else chord.times_s[1]
         closed[valve].append((begin, math.inf if last > reach and is_last else end))
 
 
 def _contacts_of_pass(
-    way: Pass, edges: list[PlainEdge], half_m: list[float]
-) -> list[Contact] | None:
-    """Return the contacts on a straight pass; None where the boom lies along its own motion."""
-    rx, ry = way.right
+    way: Pass, edges: list[PlainEdge], boom: Boom, buffer_m: float
+) -> list[Contact]:
+    """Return the contacts on a straight pass, buffer included."""
     contacts: list[Contact] = []
-    for valve, ((px, py, dx, dy, length, _), half) in enumerate(
-        zip(way.points, half_m, strict=True)
+    for valve, ((px, py, dx, dy, length, _), (_, _, half)) in enumerate(
+        zip(way.points, boom.strips_m, strict=True)
     ):
+        rx, ry = way.right
         safe = max(length, 1e-12)
         ux, uy = dx / safe, dy / safe
-        turn = (dx * ry - dy * rx) / safe  # sine of the angle from path to boom
+        turn = ux * ry - uy * rx  # sine of the angle from path to boom
+        margin = buffer_m
         if not abs(turn) >= ACROSS_MIN:
-            return None
+            # What surrounds the strip lies square to the way.
+            margin += half * abs(ux * rx + uy * ry)
+            half, turn, rx, ry = half * abs(turn), -1.0, uy, -ux
+        half += buffer_m
         for edge, (x0, y0, x1, y1, _) in enumerate(edges):
             across_0 = (ux * (y0 - py) - uy * (x0 - px)) / turn
             across_1 = (ux * (y1 - py) - uy * (x1 - px)) / turn
@@ -514,39 +636,50 @@ def _contacts_of_pass(
                 continue
             along_0 = ((x0 - px) * ry - (y0 - py) * rx) / turn
             along_1 = ((x1 - px) * ry - (y1 - py) * rx) / turn
-            limits = _clip((across_0, along_0), (across_1, along_1), half)
-            contacts.append((valve, edge, limits))
+            first, last = _clip((across_0, along_0), (across_1, along_1), half)
+            contacts.append((valve, edge, (first - margin, last + margin)))
     return contacts
 
 
-def _contacts(paths: Paths, chord: int, ends: Floats, half_m: Floats) -> list[Contact] | None:
-    """Return the contacts of one chord, in the skewed frame of path and boom; None as above."""
+def _contacts(paths: Paths, chord: int, ends: Floats, boom: Boom, buffer_m: float) -> list[Contact]:
+    """Return the contacts of one chord, in the skewed frame of path and boom.
+
+    What the chord leaves out of an arc is added to the buffer.
+    """
     px, py = paths.east_m[:, chord], paths.north_m[:, chord]
-    dx, dy = paths.step_east_m[:, chord], paths.step_north_m[:, chord]
-    rx, ry = paths.right[chord]
     safe = np.maximum(paths.length_m[:, chord], 1e-12)
-    turn = (dx * ry - dy * rx) / safe  # sine of the angle from path to boom
-    if not np.abs(turn).min() >= ACROSS_MIN:
-        return None
-    ux, uy, t2 = (dx / safe)[:, None], (dy / safe)[:, None], turn[:, None]
+    ux, uy = paths.step_east_m[:, chord] / safe, paths.step_north_m[:, chord] / safe
+    boom_x, boom_y = paths.right[chord]
+    half, margin = boom.half_width_m, np.full(len(px), buffer_m)
+    turn = ux * boom_y - uy * boom_x  # sine of the angle from path to boom
+    if paths.off_m is not None:
+        margin = margin + paths.off_m[:, chord]
+    is_along = ~(np.abs(turn) >= ACROSS_MIN)
+    aside = np.where(is_along, half * np.abs(turn), half) + margin
+    if paths.turned:
+        margin = margin + half * paths.turned[chord]
+    margin = margin + np.where(is_along, half * np.abs(ux * boom_x + uy * boom_y), 0.0)
+    rx, ry = np.where(is_along, uy, boom_x)[:, None], np.where(is_along, -ux, boom_y)[:, None]
+    ux, uy, t2 = ux[:, None], uy[:, None], np.where(is_along, -1.0, turn)[:, None]
     x, y = ends[:, 0::2].ravel() - px[:, None], ends[:, 1::2].ravel() - py[:, None]
     across = (ux * y - uy * x) / t2
     across_0, across_1 = across[:, 0::2], across[:, 1::2]
-    half = half_m[:, None]
+    half = aside[:, None]
     touching = (np.minimum(across_0, across_1) <= half) & (np.maximum(across_0, across_1) >= -half)
     valves, hits = touching.nonzero()
     if not len(valves):
         return []
     along = (x * ry - y * rx) / t2
     along_0, along_1 = along[:, 0::2], along[:, 1::2]
-    return [
-        (valve, hit, _clip(
+    contacts: list[Contact] = []
+    for valve, hit in zip(valves.tolist(), hits.tolist(), strict=True):
+        first, last = _clip(
             (float(across_0[valve, hit]), float(along_0[valve, hit])),
             (float(across_1[valve, hit]), float(along_1[valve, hit])),
-            float(half_m[valve]),
-        ))
-        for valve, hit in zip(valves.tolist(), hits.tolist(), strict=True)
-    ]  # fmt: skip
+            float(aside[valve]),
+        )
+        contacts.append((valve, hit, (first - float(margin[valve]), last + float(margin[valve]))))
+    return contacts
 
 
 def _clip(a: tuple[float, float], b: tuple[float, float], half_m: float) -> tuple[float, float]:

@@ -310,6 +310,7 @@ def _routes(
         across=setup.across,
         drift_m=drift_m,
         close_more=_off_lines(setup, state, before),
+        leads_s=setup.leads_s,
     )
     if setup.overlap is not None:
         treated = treated_before(

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Callable, Sequence, Set
+from functools import partial
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ import numpy as np
 from companion.core.boom import (
     STRAIGHT_YAW_RATE_DEG_S,
     Boom,
+    Chord,
     Intervals,
     Pass,
     Paths,
@@ -86,16 +88,8 @@ def rate_at(route: Sequence[Crossing], now_s: float) -> float | None:
 # the way, whose polygon that is, on which chord, and at which share of it. As they are sorted,
 # leaving comes before entering, where both are at one place.
 _Cut = tuple[int, bool, float, int, int, float]
-# When a chord of a point's path (its number, and the chord's) begins and ends, and how fast then.
-_ChordOf = Callable[[int, int], tuple[Sequence[float], Sequence[float]]]
-
-
-def _at(chord: tuple[Sequence[float], Sequence[float]], share: float) -> tuple[float, float]:
-    """Return when the path is at a share of a chord, and how fast."""
-    (t0, t1), (v0, v1) = chord
-    v0_2 = v0 * v0
-    speed = math.sqrt(v0_2 + (v1 * v1 - v0_2) * share)
-    return t0 + share * (v0 + v1) / max(v0 + speed, 1e-9) * (t1 - t0), speed
+# How a chord is flown, of a point's number and the chord's.
+_ChordOf = Callable[[int, int], Chord]
 
 
 # Where a path meets an edge: chord, rounded way along it, whether its polygon is entered, point,
@@ -198,6 +192,7 @@ def find_routes(
     across: Across,
     drift_m: Offset | None = None,
     close_more: Callable[[Paths, list[Intervals]], None] | None = None,
+    leads_s: tuple[float, ...] = (),
 ) -> tuple[Route, ...]:
     """Return what each valve is prescribed along its predicted path, left to right.
 
@@ -212,16 +207,19 @@ def find_routes(
         way = straight_pass(state, boom, back_s=back_s, ahead_s=ahead_s)
     if way is not None:
         return _routes_of_pass(prescription, way, boom, reach_m, border, border_buffer_m)
-    paths = predict(state, boom.right_m, boom.forward_m, back_s=back_s, ahead_s=ahead_s)
+    paths = predict(
+        state, boom.right_m, boom.forward_m, back_s=back_s, ahead_s=ahead_s, leads_s=leads_s
+    )
     ends, owner = prescription.edges_near(*box_of(paths.middle, reach_m))
     bases = prescription.owners_at(*_starts(paths))
     cuts, chord_of = _cuts(paths, ends, owner), paths.chord_of
-    speeds = paths.speed_m_s[:, [0, -1]].tolist()
-    span_s = paths.time_s[0], paths.time_s[-1]
     if across == "centre":
         rates = _rates(prescription, chord_of, bases, cuts)
     else:
-        rates = _rates_across(prescription, state, boom, (ends, owner), across, back_s, ahead_s)
+        rates = _rates_across(
+            prescription, boom, (ends, owner), across,
+            partial(predict, state, back_s=back_s, ahead_s=ahead_s, leads_s=leads_s),
+        )  # fmt: skip
     closed = _centres_outside(chord_of, bases, cuts)
     if border == "inside":
         edges = ends[owner == FIELD]
@@ -231,8 +229,8 @@ def find_routes(
         add_contacts(paths, edges, boom, border_buffer_m, closed, merge)
     if close_more is not None:
         close_more(paths, closed)
-    each = zip(rates, closed, speeds, strict=True)
-    return tuple([_combine(*one, span_s, border) for one in each])
+    each = enumerate(zip(rates, closed, strict=True))
+    return tuple([_combine(*one, partial(paths.speed_at, point), border) for point, one in each])
 
 
 def _routes_of_pass(
@@ -249,10 +247,9 @@ def _routes_of_pass(
     edges = near.edges_in(box)
     bases = prescription.owners_near(near, *_starts_of_pass(way))
     cuts = _cuts_of_pass(way, edges)
-    every_chord = (way.time_s, way.speed_m_s)
 
-    def chord_of(_point: int, _chord: int) -> tuple[Sequence[float], Sequence[float]]:
-        return every_chord
+    def chord_of(_point: int, _chord: int) -> Chord:
+        return way.chord
 
     rates = _rates_of_pass(prescription, way, chord_of, bases, cuts)
     closed = _centres_outside(chord_of, bases, cuts)
@@ -262,7 +259,7 @@ def _routes_of_pass(
     each = zip(rates, closed, strict=True)
     return tuple(
         [
-            _combine(steps, shut, way.speed_m_s, way.time_s, border) if shut else tuple(steps)
+            _combine(steps, shut, way.chord.speed_at, border) if shut else tuple(steps)
             for steps, shut in each
         ]
     )
@@ -282,8 +279,9 @@ def _rates(
     timelines = []
     for point, (base, cuts) in enumerate(zip(bases, found, strict=True)):
         zones = _NO_FIELD.union(base) - _ONLY_FIELD
-        (start_s, _), (pace, _) = chord_of(point, 0)
-        begun = [Crossing(start_s, prescription.rate_of(zones), False, pace)]
+        first = chord_of(point, 0)
+        rate = prescription.rate_of(zones)
+        begun = [Crossing(first.times_s[0], rate, False, first.speeds_m_s[0])]
         steps = _walked(prescription, chord_of, point, zones, begun, cuts) if cuts else begun
         timelines.append(steps)
     return timelines
@@ -300,14 +298,14 @@ def _rates_of_pass(
     found: list[list[_Cut]],
 ) -> list[_Steps]:
     """Return the rate along each point's path; points that begin in the same zones begin alike."""
-    timelines = []
+    timelines, chord = [], way.chord
     alike: dict[frozenset[int], tuple[frozenset[int], _Steps]] = {}
     for point, (base, cuts) in enumerate(zip(bases, found, strict=True)):
         start = alike.get(base)
         if start is None:
             zones = base - _ONLY_FIELD
             rate = prescription.rate_of(zones)
-            start = zones, [Crossing(way.time_s[0], rate, False, way.speed_m_s[0])]
+            start = zones, [Crossing(chord.times_s[0], rate, False, chord.speeds_m_s[0])]
             alike[base] = start
         steps = _walked(prescription, chord_of, point, *start, cuts) if cuts else start[1]
         timelines.append(steps)
@@ -334,7 +332,7 @@ def _walked(
             continue  # the next zone begins here: a gap this narrow is none
         new = prescription.rate_of(frozenset(inside))
         if new != rate:
-            at_s, speed = _at(chord_of(point, chord), share)
+            at_s, speed = chord_of(point, chord).at(share)
             steps.append(Crossing(at_s, new, False, speed))
             rate = new
     return steps
@@ -365,19 +363,17 @@ def _starts_of_pass(way: Pass) -> tuple[list[float], list[float]]:
 
 def _rates_across(
     prescription: Prescription,
-    state: VehicleState,
     boom: Boom,
     edges: tuple[Floats, Ints],
     across: Across,
-    back_s: float,
-    ahead_s: float,
+    paths_of: Callable[[Floats, Floats], Paths],
 ) -> list[_Steps]:
     """Return the mean or the maximum over each strip, from points across it."""
     shares, weights = _across(2.0 * float(boom.half_width_m.max()))
     count = len(shares)
     right = (boom.right_m[:, None] + boom.half_width_m[:, None] * shares).ravel()
     forward = np.repeat(boom.forward_m, count)
-    paths = predict(state, right, forward, back_s=back_s, ahead_s=ahead_s)
+    paths = paths_of(right, forward)
     bases = prescription.owners_at(*_starts(paths))
     every = _rates(prescription, paths.chord_of, bases, _cuts(paths, *edges))
     timelines = []
@@ -430,11 +426,11 @@ def _centres_outside(
         inside = FIELD in base
         if inside and not cuts:
             continue
-        since_s = chord_of(point, 0)[0][0]
+        since_s = chord_of(point, 0).times_s[0]
         for _, enters, _, owner, chord, share in cuts:
             if owner != FIELD or enters is inside:
                 continue
-            at_s, _ = _at(chord_of(point, chord), share)
+            at_s, _ = chord_of(point, chord).at(share)
             if enters:
                 intervals.append((since_s, at_s))
             inside, since_s = enters, at_s
@@ -444,11 +440,7 @@ def _centres_outside(
 
 
 def _combine(
-    rates: _Steps,
-    closed: Intervals,
-    speeds: Sequence[float],
-    span_s: tuple[float, float],
-    border: Border,
+    rates: _Steps, closed: Intervals, speed_at: Callable[[float], float], border: Border
 ) -> Route:
     """Return one timeline of rates, closed where the border rule says so.
 
@@ -459,17 +451,16 @@ def _combine(
         return tuple(rates)
     strict = border == "inside"
     ends = {t for interval in closed for t in interval if t < math.inf}
-    (start_s, end_s), (begun, ended) = span_s, speeds
     pace = {step.at_s: step.speed_m_s for step in rates}
     route: list[Crossing] = []
-    for at_s in sorted(ends | set(pace) | {start_s}):
+    for at_s in sorted(ends | set(pace)):
         shut = any(begin <= at_s < end for begin, end in closed)
         rate = None if shut else rate_at(rates, at_s)
         outside = strict and shut
         if not route or rate != route[-1].rate_l_ha or outside != route[-1].outside:
             speed = pace.get(at_s)
             if speed is None:
-                speed = begun + (at_s - start_s) / (end_s - start_s) * (ended - begun)
+                speed = speed_at(at_s)
             route.append(Crossing(at_s, rate, outside, speed))
     return tuple(route)
 

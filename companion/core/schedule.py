@@ -167,10 +167,10 @@ class Timing:
         )
 
     @property
-    def longest_s(self) -> float:
-        """Return the longest lead of all."""
+    def leads_s(self) -> tuple[float, ...]:
+        """Return all leads, that of an opening at the border at its longest."""
         opens_s = self.border_on_s + self.rest_s(0.0)
-        return max(self.on_s, self.off_s, self.up_s, self.down_s, self.border_off_s, opens_s)
+        return self.on_s, self.off_s, self.up_s, self.down_s, self.border_off_s, opens_s
 
     def rest_s(self, duty: float) -> float:
         """Return by how much sooner a valve may open at the border, at rest before its first pulse.

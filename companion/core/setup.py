@@ -62,6 +62,8 @@ class Setup:
     timings: tuple[Timing, ...] = field(init=False, repr=False, compare=False)  # of each valve
     # The longest lead of any order: of valves, pump and atomisers.
     longest_s: float = field(init=False, repr=False, compare=False)
+    # All leads of orders, in order: a path in a turn is exact there.
+    leads_s: tuple[float, ...] = field(init=False, repr=False, compare=False)
     # How far behind a path begins, so that short stays are seen whole.
     back_s: float = field(init=False, repr=False, compare=False)
     # How far ahead a path must reach: the lease, the longest lead and a short stay.
@@ -92,7 +94,8 @@ class Setup:
         object.__setattr__(self, "timings", timings)
         object.__setattr__(self, "pumping", self._pumping())
         stays_s = 2.0 * max(timing.dwell_min_s for timing in timings)
-        object.__setattr__(self, "longest_s", self._longest_s())
+        object.__setattr__(self, "leads_s", self._leads_s())
+        object.__setattr__(self, "longest_s", self.leads_s[-1])
         object.__setattr__(self, "back_s", 0.1 + stays_s)
         ahead_s = self.lease_s + (self.longest_s + stays_s) + ROUTES_KEPT_S + 0.05
         object.__setattr__(self, "ahead_s", ahead_s)
@@ -157,10 +160,9 @@ class Setup:
         """Return what makes the flow: the valves, or the pump in their place."""
         return self if self.pumping is None else self.pumping
 
-    def _longest_s(self) -> float:
-        longest_s = max(timing.longest_s for timing in self.timings)
+    def _leads_s(self) -> tuple[float, ...]:
+        leads = {lead_s for timing in self.timings for lead_s in timing.leads_s}
         if self.pumping is not None:
-            longest_s = max(longest_s, self.pumping.timing.longest_s)
-        for atomiser in self.atomisers:
-            longest_s = max(longest_s, atomiser.spin_up_s + self.lag.output_s)
-        return longest_s
+            leads.update(self.pumping.timing.leads_s)
+        leads.update(atomiser.spin_up_s + self.lag.output_s for atomiser in self.atomisers)
+        return tuple(sorted(leads))

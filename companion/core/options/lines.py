@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.core.boom import Boom, Intervals, Paths, time_on_chord
+from companion.core.boom import Boom, Intervals, Paths
 from companion.core.frame import Floats, Place
 from companion.core.inputs import MISSION_MODES
 from companion.core.types import MissionLeg, VehicleState
@@ -261,13 +261,12 @@ def _within(
         if not first < last or not low_m < high_m:
             continue
         # A chord's own ends are its times, to the last bit: the next one goes on there.
-        times_s, speeds_m_s = paths.chord_of(valve, chord)
-        since_s, until_s = times_s
-        reach = paths.length_m.item(valve, chord)
+        flown = paths.chord_of(valve, chord)
+        since_s, until_s = flown.times_s
         if first > 0.0:
-            since_s = time_on_chord(times_s, speeds_m_s, first * reach, reach)[0]
+            since_s = flown.at(first)[0]
         if last < 1.0:
-            until_s = time_on_chord(times_s, speeds_m_s, last * reach, reach)[0]
+            until_s = flown.at(last)[0]
         found.append((since_s, until_s))
     return found
 

@@ -33,6 +33,8 @@ STRETCH_MIN_M = 0.5
 # Below this nothing is sprayed: a way that hardly leads anywhere has no stretches.
 WAY_MIN_M = 0.05
 WAY_MAX_M = 500.0
+# Of a chord on which an acceleration fades so many times are worked out, straight between them.
+FADING_KNOTS = 33
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,11 +143,7 @@ def _along(
     shares = (np.arange(count) + 0.5) / count
     times, east, north = [], [], []
     for chord in range(chords):
-        t0, t1 = paths.time_s[chord], paths.time_s[chord + 1]
-        v0, v1 = paths.speed_m_s[:, chord, None], paths.speed_m_s[:, chord + 1, None]
-        # Speed changes evenly along a chord, as in `boom.time_on_chord`.
-        pace = np.sqrt(np.maximum(v0 * v0 + (v1 * v1 - v0 * v0) * shares, 0.0))
-        times.append(t0 + shares * (v0 + v1) / np.maximum(v0 + pace, 1e-9) * (t1 - t0))
+        times.append(_times(paths, chord, shares))
         right_east, right_north = paths.right[chord]
         x = paths.east_m[:, chord, None] + shares * paths.step_east_m[:, chord, None]
         y = paths.north_m[:, chord, None] + shares * paths.step_north_m[:, chord, None]
@@ -153,6 +151,21 @@ def _along(
         north.append(y[:, :, None] + (aside_m * right_north)[:, None, :])
     covered = treated.covered_at(np.concatenate(east, axis=1), np.concatenate(north, axis=1))
     return np.concatenate(times, axis=1), covered.sum(axis=2) >= share * across - 1e-9
+
+
+def _times(paths: Paths, chord: int, shares: Floats) -> Floats:
+    """Return when each point is at shares of a chord."""
+    if paths.fading is not None and not chord:  # the same of all points
+        flown = paths.chord_of(0, 0)
+        knots = np.linspace(0.0, 1.0, FADING_KNOTS)
+        at_s = [flown.at(share)[0] for share in knots.tolist()]
+        return np.tile(np.interp(shares, knots, at_s), (len(paths.length_m), 1))
+    t0, t1 = paths.time_s[chord], paths.time_s[chord + 1]
+    v0, v1 = paths.speed_m_s[:, chord, None], paths.speed_m_s[:, chord + 1, None]
+    # Speed changes evenly, as in `boom.Chord`.
+    pace = np.sqrt(np.maximum(v0 * v0 + (v1 * v1 - v0 * v0) * shares, 0.0))
+    found: Floats = t0 + shares * (v0 + v1) / np.maximum(v0 + pace, 1e-9) * (t1 - t0)
+    return found
 
 
 def _smooth(own: Bools, least: int) -> Bools:
