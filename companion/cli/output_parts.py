@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 # ----------------------------------------------------------------------------------------- the link
 
-PARAMETERS_NAME = "parameters.json"
+PARAMETERS_NAME, STOP_NAME = "parameters.json", "stop.json"
 
 
 def load_with_kept(path: Path, overrides: Sequence[str]) -> tuple[Config, tuple[str, ...]]:
@@ -79,7 +79,11 @@ def build_link(config: Config, given: Sequence[str], options: ComponentOptions) 
         return None
 
     parameters = Parameters(
-        known_parameters(settings, tank_l=tank_l), kept=read_state(state), save=save, check=check
+        known_parameters(settings, tank_l=tank_l),
+        kept=read_state(state),
+        save=save,
+        check=check,
+        stop_file=state.with_name(STOP_NAME),
     )
     signing = None
     if config.link.signing_key_file is not None:

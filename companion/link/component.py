@@ -6,6 +6,7 @@ No I/O: bytes and times come in, bytes go out through `send`, which says whether
 from __future__ import annotations
 
 import math
+import secrets
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -115,6 +116,8 @@ class Component:
     ) -> None:
         self._options = options
         self._transport_send = send
+        self._signing = signing
+        self._has_begun = False
         self._encoder = Encoder(
             system_id=options.system_id or 1, component_id=options.component_id, signing=signing
         )
@@ -132,6 +135,7 @@ class Component:
             tank=Tank(),
             may_enable=options.may_enable,
             page_may_enable=options.page_may_enable,
+            signing=signing,
         )
         self._service = Service(
             self._command_state, self._encoder, self._announcer, self._send, version=options.version
@@ -217,11 +221,14 @@ class Component:
     def receive(self, data: bytes, received_s: float) -> list[Input]:
         """Return the inputs in `data`, and answer what wants an answer."""
         inputs: list[Input] = []
+        if not self._has_begun:
+            self._has_begun = True
+            inputs += self._command_state.begin(received_s)
         for message in self._heard(data, received_s):
             if self._supervisor is None and self.is_vehicle_known:
                 self._meet(received_s)
-            if isinstance(message, AttitudeReport | ImuReport) and not self._options.use_imu:
-                continue  # another station asked for it
+            if self._is_ignored(message):
+                continue
             if _is_input(message):
                 self._look_at(message)
                 inputs.append(self._wind.take(message))
@@ -273,7 +280,7 @@ class Component:
         is_quick = round_trip_s is not None and round_trip_s <= _QUICK_S
         if now_s - self._timesync_s >= (_TIMESYNC_S if is_quick else _TIMESYNC_SLOW_S):
             self._timesync_s = now_s
-            self._send(self._encoder.timesync(0, self.clock.ask(now_s)))
+            self._send(self._encoder.timesync(0, self._ask_time(now_s)))
 
     def link_changed(self, now_s: float) -> None:
         """Ask for the streams anew: whoever answers now may not have heard us before."""
@@ -281,6 +288,20 @@ class Component:
             self._meet(now_s)
 
     # ------------------------------------------------------------------------------- inside
+
+    def _is_ignored(self, message: Message) -> bool:
+        """Return whether it is for another station, or a switch whose edge may be of before."""
+        if isinstance(message, RcReport):
+            return self._signing is not None and not self._signing.is_fresh
+        return isinstance(message, AttitudeReport | ImuReport) and not self._options.use_imu
+
+    def _ask_time(self, now_s: float) -> int:
+        """Return the number of a question of the time; signed, one that nobody can foresee."""
+        if self._signing is None:
+            return self.clock.ask(now_s)
+        number = self.clock.ask(now_s, secrets.randbits(62))
+        self._signing.asked(number)
+        return number
 
     def _mission_reader(self) -> MissionReader | None:
         """Return what reads the mission; where no mission is used, nothing of it is loaded."""
@@ -514,22 +535,23 @@ class ClockExchanges:
     """Matches answers with questions, and keeps how quick the last ones were."""
 
     def __init__(self) -> None:
-        self._asked_ns: deque[int] = deque(maxlen=8)
+        self._asked_ns: deque[tuple[int, int]] = deque(maxlen=8)
         self._round_trips_s: deque[float] = deque(maxlen=_KEPT)
         self._news: list[ClockReport] = []
 
-    def ask(self, now_s: float) -> int:
-        """Return the number to send, which the answer will bring back."""
+    def ask(self, now_s: float, number: int | None = None) -> int:
+        """Return the number that the answer will bring back; if none is given, the time."""
         asked_ns = round(now_s * 1e9)
-        self._asked_ns.append(asked_ns)
-        return asked_ns
+        self._asked_ns.append((asked_ns if number is None else number, asked_ns))
+        return self._asked_ns[-1][0]
 
-    def answer(self, tc1_ns: int, ts1_ns: int, received_s: float) -> None:
+    def answer(self, tc1_ns: int, number: int, received_s: float) -> None:
         """Take an answer; one to somebody else's question is ignored."""
-        if ts1_ns not in self._asked_ns:
+        asked_ns = dict(self._asked_ns).get(number)
+        if asked_ns is None:
             return
-        self._asked_ns.remove(ts1_ns)
-        asked_s = ts1_ns * 1e-9
+        self._asked_ns.remove((number, asked_ns))
+        asked_s = asked_ns * 1e-9
         round_trip_s = received_s - asked_s
         if not round_trip_s >= 0.0:
             return

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import stat
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -81,7 +82,10 @@ class Parameters:
         kept: Mapping[str, float] | None = None,
         save: Save | None = None,
         check: Check | None = None,
+        stop_file: Path | None = None,
     ) -> None:
+        self._stop_file = stop_file
+        self.is_stopped = stop_file is not None and stop_file.exists()
         self._known = {one.name: one for one in known}
         self._order = [one.name for one in known]
         self._values = {one.name: one.value for one in known}
@@ -92,6 +96,17 @@ class Parameters:
         }
         self._values.update(self._kept)
         self._save, self._check = save, check
+
+    def keep_stop(self, is_stopped: bool) -> None:
+        """Keep that a stop was commanded, and not ended yet, for the next start too."""
+        if is_stopped == self.is_stopped or self._stop_file is None:
+            return
+        self.is_stopped = is_stopped
+        if is_stopped:
+            write_state(self._stop_file, {"stopped": 1.0})
+        else:
+            with suppress(OSError):
+                self._stop_file.unlink(missing_ok=True)
 
     @staticmethod
     def _in_range(one: Parameter, value: float) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from companion.core.types import (
     Decision,
@@ -17,6 +18,9 @@ from companion.link.announcer import Announcer
 from companion.link.encode import REAL32, Encoder
 from companion.link.messages import CommandReceived, ParamAsked, ParamSet, Sender, Tank
 from companion.link.parameters import RATE_PERCENT, TANK_L, VALUES_HZ, Parameters
+
+if TYPE_CHECKING:
+    from companion.link.signing import Signing
 
 # ----------------------------------------------------------------------------------------- commands
 
@@ -76,10 +80,14 @@ class CommandState:
     is_enabled: bool = False
     # When the consent last went, by whatever took it; None: it was given anew since.
     stopped_s: float | None = None
+    # Whether a stop was commanded, in this run or before, and not ended by a DISABLE.
+    is_stopped: bool = False
     # Who gave the last ENABLE, and its frame's number.
     enabled_by: tuple[Sender, int] | None = None
     # The sensor that counts the tank, where there is one; whether it takes this many litres.
     on_refilled: Callable[[float], bool] | None = None
+    # Of a signed link: what says whether an order to open may be one of before this start.
+    signing: Signing | None = None
 
     def look_at(self, decision: Decision | None, now_s: float) -> None:
         """Take what was decided: whether a valve is open, and whether the operator's consent went.
@@ -92,6 +100,14 @@ class CommandState:
         if self.is_enabled and not is_enabled:
             self.stopped_s = now_s
         self.is_enabled = is_enabled
+        if not self.is_open:  # the disk is not waited for before all is closed
+            self.parameters.keep_stop(self.is_stopped)
+
+    def begin(self, now_s: float) -> list[Input]:
+        """Take that a run begins; return the stop that was commanded before it and not ended."""
+        self.is_stopped = self.parameters.is_stopped
+        stop = EstopReport(received_s=now_s, pressed=True, source="command")
+        return [stop] if self.is_stopped else []
 
     def is_old(self, command: CommandReceived) -> bool:
         """Return whether an ENABLE may have been sent before the last stop."""
@@ -121,24 +137,48 @@ def _sprayer(command_state: CommandState, command: CommandReceived) -> Answer:
     if command.param1 not in (0.0, 1.0):
         return Answer(result=DENIED, text="DO_SPRAYER takes 0 or 1")
     enable = command.param1 == 1.0
-    if enable and command.source == "web" and not command_state.page_may_enable:
-        return Answer(result=DENIED, text="enable by page: see safety.enable_by")
-    if enable and command.source == "command" and not command_state.may_enable:
-        return Answer(result=DENIED, text="enable by command: see safety.enable_by")
-    if enable and command.target_system == 0:
-        return Answer(result=DENIED, text="enable: name this vehicle's system, not 0")
-    if enable and command_state.is_old(command):
-        return Answer(result=REJECTED_FOR_NOW, text="late enable not taken: enable again")
+    answer = _without_enabling(command_state, command) if enable else None
+    if answer is not None:
+        return answer
     command_state.stopped_s = None if enable else command.received_s
+    command_state.is_stopped = enable and command_state.is_stopped
     if enable:
         command_state.enabled_by = (command.sender, command.sequence)
     wish = OperatorCommand(received_s=command.received_s, enable=enable, source=command.source)
     return Answer(result=ACCEPTED, inputs=(wish,))
 
 
+def _without_enabling(command_state: CommandState, command: CommandReceived) -> Answer | None:
+    """Return the answer to an ENABLE that enables nothing; None for one to obey."""
+    if command.source == "web" and not command_state.page_may_enable:
+        return Answer(result=DENIED, text="enable by page: see safety.enable_by")
+    if command.source == "command" and not command_state.may_enable:
+        return Answer(result=DENIED, text="enable by command: see safety.enable_by")
+    if command.target_system == 0:
+        return Answer(result=DENIED, text="enable: name this vehicle's system, not 0")
+    if command_state.is_old(command):
+        return Answer(result=REJECTED_FOR_NOW, text="late enable not taken: enable again")
+    if command_state.signing is None or command.source != "command":
+        return None
+    return _unless_admitted(command_state, command_state.signing)
+
+
+def _unless_admitted(command_state: CommandState, signing: Signing) -> Answer | None:
+    """Return the answer to a signed ENABLE that changes nothing, or must not; None to obey it.
+
+    The disk is not waited for while a valve may be open: consent that is there stays, and one that
+    was just taken back is given anew once all is closed.
+    """
+    if command_state.is_enabled and command_state.stopped_s is None:
+        signing.keep_soon()
+        return Answer(result=ACCEPTED)
+    refusal = "closing: enable again" if command_state.is_open else signing.admit()
+    return None if refusal is None else Answer(result=REJECTED_FOR_NOW, text=refusal)
+
+
 def _estop(command_state: CommandState, command: CommandReceived) -> Answer:
     """Take an emergency stop, whatever its parameters: DO_SPRAYER 0 ends it."""
-    command_state.stopped_s = command.received_s
+    command_state.stopped_s, command_state.is_stopped = command.received_s, True
     stop = EstopReport(received_s=command.received_s, pressed=True, source="command")
     return Answer(result=ACCEPTED, inputs=(stop,), text="emergency stop", event="emergency stop")
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from companion.core.controller import Memory, step
-from companion.core.types import EstopReport, OperatorCommand, RateOverride
+from companion.core.types import EstopReport, Input, OperatorCommand, RateOverride
 from companion.link.component import Component, ComponentOptions
 from companion.link.parameters import Parameters, known_parameters
 from tests import builders
@@ -138,6 +139,44 @@ def test_a_retransmission_does_not_bring_back_what_the_pilot_took(
     component.tick(taken_back, 2.5)
     assert not enables(peer, component, 2.6, confirmation=1)
     assert enables(peer, component, 2.7)
+
+
+@pytest.mark.parametrize("is_pressed_again", [False, True])
+def test_a_commanded_stop_outlives_a_restart_until_somebody_disables(
+    peer: Peer, tmp_path: Path, is_pressed_again: bool
+) -> None:
+    def started() -> Component:
+        parameters = Parameters(stop_file=tmp_path / "state" / "stop.json")
+        return Component(ComponentOptions(), peer.take, parameters=parameters)
+
+    def after(component: Component, *commands: bytes) -> list[Input]:
+        inputs = component.receive(peer.heartbeat(), 0.0)
+        for at_s, command in enumerate(commands, start=1):
+            inputs += component.receive(command, float(at_s))
+        component.tick(CLOSED, 5.0)
+        return [item for item in inputs if isinstance(item, EstopReport)]
+
+    stop, disable = peer.command(31014), peer.command(216, 0.0)
+    assert after(started()) == []
+    assert len(after(started(), stop)) == 1
+    again = (disable, stop) if is_pressed_again else ()
+    assert after(started(), *again)[0] == EstopReport(
+        received_s=0.0, pressed=True, source="command"
+    )
+    assert len(after(started(), peer.command(216, 1.0))) == 1  # an ENABLE does not end it
+    assert len(after(started(), disable)) == 1
+    assert after(started()) == []
+
+
+def test_the_disk_is_not_waited_for_before_a_stop_has_closed(peer: Peer, tmp_path: Path) -> None:
+    stop_file = tmp_path / "stop.json"
+    component = Component(ComponentOptions(), peer.take, parameters=Parameters(stop_file=stop_file))
+    component.receive(peer.heartbeat(), 0.0)
+    component.receive(peer.command(31014), 1.0)
+    component.tick(OPEN, 1.0)
+    assert not stop_file.exists()
+    component.tick(CLOSED, 1.05)
+    assert stop_file.exists()
 
 
 def test_a_copy_that_comes_late_enables_nothing_after_a_stop(

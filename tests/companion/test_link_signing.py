@@ -140,6 +140,32 @@ def test_no_more_streams_than_a_link_can_have_are_remembered() -> None:
     assert count(guard, *frames) == 0  # and a replay of all of them is refused
 
 
+def test_the_file_stays_small_and_what_it_drops_is_old_for_good(tmp_path: Path) -> None:
+    frames: list[bytes] = []
+    for start in range(10):
+        guard, vehicle = signing(tmp_path), Station(system=1, stamp=STAMP + 1000 * start)
+        guard.asked(7)  # answered by a stream of now: the file is to be relied on
+        assert count(guard, bytes(vehicle.mav.timesync_encode(1, 7).pack(vehicle.mav))) == 1
+        new = [
+            Station(system=2 + 20 * start + number, stamp=STAMP + 1000 * start + 10 + number)
+            for number in range(20)
+        ]
+        frames += [station.heartbeat() for station in new]
+        assert count(guard, *frames) == 20  # and none of before
+        guard.keep(is_last=True)
+    assert len(read_state(tmp_path / STATE_NAME)) < 100
+    assert count(signing(tmp_path), *frames) == 0
+
+
+def test_two_programs_with_one_file_forget_no_stream_of_each_other(tmp_path: Path) -> None:
+    run, doctor = signing(tmp_path), signing(tmp_path)
+    frame = Station(system=255).heartbeat()
+    assert count(run, frame) == 1
+    run.keep(is_last=True)
+    doctor.keep(is_last=True)
+    assert count(signing(tmp_path), frame) == 0
+
+
 @given(at=st.integers(0, 33), bit=st.integers(0, 7))
 def test_no_changed_bit_is_believed(at: int, bit: int) -> None:
     frame = bytearray(Station().heartbeat())

@@ -92,6 +92,22 @@ class WirePeer:
         self._parser.robust_parsing = True
         self._streams: dict[int, asyncio.Task[None]] = {}
         self._news = asyncio.Event()
+        self.clock: Callable[[], float] | None = None
+        self.answers_time = False
+
+    def sign(self, key: bytes, clock: Callable[[], float] = time.time) -> None:
+        """Sign everything by a clock (Unix time), and follow later stamps, as others do."""
+        self.clock = clock
+        for mav in (self._mav, self._ground, self._parser):
+            mav.signing.secret_key = key
+        self._mav.signing.sign_outgoing = self._ground.signing.sign_outgoing = True
+
+    def _pack(self, mav: mavlink.MAVLink, message: Any) -> bytes:
+        if self.clock is not None:
+            stamp = round((self.clock() - 1_420_070_400) * 1e5)
+            known = max(mav.signing.timestamp, self._parser.signing.timestamp)
+            mav.signing.timestamp = max(stamp, known + 1)
+        return bytes(message.pack(mav))
 
     # ---------------------------------------------------------------------------- life
 
@@ -136,7 +152,7 @@ class WirePeer:
     def send(self, message_id: int) -> None:
         message = self._compose(message_id)
         if message is not None:
-            self.write(bytes(message.pack(self._mav)))
+            self.write(self._pack(self._mav, message))
             self._mav.seq = (self._mav.seq + 1) % 256
         if self.twin and message_id == 0:
             beat = self._twin.heartbeat_encode(18, 8, 0, 0, 4)
@@ -177,7 +193,7 @@ class WirePeer:
     def command_companion(self, command: int, param1: float) -> None:
         """Send a command of the ground station to component 1/191."""
         message = self._ground.command_long_encode(1, 191, command, 0, param1, 0, 0, 0, 0, 0, 0)
-        self.write(bytes(message.pack(self._ground)))
+        self.write(self._pack(self._ground, message))
         self._ground.seq = (self._ground.seq + 1) % 256
 
     def enable(self, is_on: bool = True) -> None:
@@ -196,6 +212,10 @@ class WirePeer:
             self.messages.append(message)
             if message.get_type() == "COMMAND_LONG" and message.target_component == 1:
                 self._obey(message, at_s)
+            if message.get_type() == "TIMESYNC" and message.tc1 == 0 and self.answers_time:
+                boot_s = at_s - self.started_s + 60.0
+                answer = self._mav.timesync_encode(round(boot_s * 1e9), message.ts1)
+                self.write(self._pack(self._mav, answer))
         self._news.set()
 
     def _obey(self, command: Any, now_s: float) -> None:
@@ -211,7 +231,7 @@ class WirePeer:
         else:
             result = UNSUPPORTED
         ack = self._mav.command_ack_encode(command.command, result, 0, 0, 1, 191)
-        self.write(bytes(ack.pack(self._mav)))
+        self.write(self._pack(self._mav, ack))
 
     # ------------------------------------------------------------------------- to await
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import shutil
 import signal
@@ -21,6 +22,7 @@ from tests.companion.wire_peer import WirePeer, free_port, over_udp
 
 pytestmark = pytest.mark.sitl
 
+KEY = bytes(range(100, 132))
 EXAMPLE = Path(__file__).parents[3] / "examples" / "anyang"
 
 
@@ -41,7 +43,9 @@ def peer_over_the_middle() -> WirePeer:
 
 
 @asynccontextmanager
-async def companion(config: Path, port: int) -> AsyncIterator[asyncio.subprocess.Process]:
+async def companion(
+    config: Path, port: int, *overrides: str
+) -> AsyncIterator[asyncio.subprocess.Process]:
     process = await asyncio.create_subprocess_exec(
         sys.executable,
         "-m",
@@ -51,6 +55,7 @@ async def companion(config: Path, port: int) -> AsyncIterator[asyncio.subprocess
         str(config),
         "--set",
         f"link.url=udpin:127.0.0.1:{port}",
+        *(word for override in overrides for word in ("--set", override)),
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
     )
@@ -112,3 +117,58 @@ async def test_a_port_in_use_is_one_line_and_exit_two(config: Path) -> None:
     lines = [line for line in stderr.decode().splitlines() if "in use" in line]
     assert len(lines) == 1
     assert "Traceback" not in stderr.decode()
+
+
+async def test_a_signed_enable_of_before_a_kill_opens_nothing_after_it(
+    config: Path, tmp_path: Path
+) -> None:
+    """Sent again by anybody, as soon as the next process listens and after it has asked."""
+    port, key = free_port(), tmp_path / "signing.key"
+    key.write_bytes(KEY)
+    key.chmod(0o600)
+    signed = f"link.signing_key_file={key}"
+    peer, captured = peer_over_the_middle(), list[bytes]()
+    peer.sign(KEY)
+    peer.answers_time = True
+
+    async def asked() -> None:
+        """Wait for the second question of the time: the first has its answer then."""
+        await peer.until(lambda: len(peer.of("TIMESYNC")) >= 2, within_s=20.0)
+
+    async with companion(config, port, signed) as process, over_udp(peer, port):
+        await asked()
+        send = peer.write
+        peer.write = lambda data: (captured.append(data), send(data))[1]
+        peer.place(east_m=-6.0)
+        peer.enable()
+        await peer.until(lambda: len(peer.open_channels) == 6)
+        process.kill()
+        await process.wait()
+    enables = [frame for frame in captured if frame[7] == 76 and frame[5] == 255]
+    assert enables
+    peer.messages.clear()
+    peer.outputs.clear()
+    async with companion(config, port, signed) as process, over_udp(peer, port):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as anybody:
+
+            async def say_again() -> None:
+                while True:
+                    for frame in enables:
+                        with contextlib.suppress(OSError):  # nobody listens yet
+                            anybody.sendto(frame, ("127.0.0.1", port))
+                    await asyncio.sleep(0.02)
+
+            again = asyncio.create_task(say_again())
+            await asked()
+            await peer.until(lambda: peer.is_all_closed)
+            peer.place(east_m=-6.0)
+            beats = len(peer.of("HEARTBEAT"))
+            await peer.until(lambda: len(peer.of("HEARTBEAT")) >= beats + 3)
+            assert peer.is_all_closed
+            again.cancel()
+            await asyncio.gather(again, return_exceptions=True)
+        peer.place(east_m=-6.0)
+        peer.enable()
+        await peer.until(lambda: len(peer.open_channels) == 6)
+        process.send_signal(signal.SIGTERM)
+        await asyncio.wait_for(process.communicate(), 10.0)
