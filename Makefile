@@ -25,7 +25,7 @@ COMPILE = $(BIN)/uv pip compile --universal --fork-strategy fewest --python-vers
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-computing test-flights test-companion test-missions test-analysis test-sitl lint format-check ruff mypy imports weight bench mutants mutants-safety faults test-gpio test-firmware arm-wheels test-image test-wheel wheel docs reference lock clean bench-missions
+.PHONY: help setup demo test test-computing test-flights test-companion test-missions test-analysis test-sitl lint format-check ruff mypy imports weight bench mutants mutants-safety faults test-gpio test-firmware arm-wheels test-image test-wheel wheel docs reference lock clean bench-missions bench-real
 
 help: ## what there is
 	@awk -F ':.*## ' '/^[a-z -]+:.*## /{printf "make %-15s %s\n", $$1, $$2}' Makefile
@@ -79,6 +79,9 @@ weight: $(INSTALLED)
 
 bench: $(INSTALLED) ## the figures that README gives (SEED=N for another draw)
 	$(BIN)/python -m tests.bench $(SEED)
+
+bench-real: $(INSTALLED) ## how exact on flights really flown: the logs in VRSPRAY_REAL (ARGS="LOG --rates 10")
+	$(BIN)/python -m tests.bench.real_flights $(ARGS)
 
 # As they are installed: each plan's process would else compile all it imports, 0.4 s.
 bench-missions: export PYTHONDONTWRITEBYTECODE :=

@@ -246,8 +246,7 @@ def _plant(name: str | None, setup: Setup) -> PlantProfile:
 def _eased(limits: Limits, flight: Recorded) -> tuple[Limits, list[str]]:
     """Return limits that let the flight be sprayed, and what of it they would have barred."""
     states, speed_m_s = flight.states, float(flight.speed_m_s.max())
-    flown = {held(flight.modes, at_s, "UNKNOWN") for at_s in states.time_s.tolist()}
-    others = {mode for mode in flown if not limits.allows(mode)}
+    others = {mode for mode in _modes(flight) if not limits.allows(mode)}
     low_m, high_m = float(states.height_m.min()), float(states.height_m.max())
     fix = Fix(min(held(flight.fixes, at_s, limits.fix) for at_s in states.time_s.tolist()))
     barred = {
@@ -270,6 +269,10 @@ def _eased(limits: Limits, flight: Recorded) -> tuple[Limits, list[str]]:
     )  # fmt: skip
     said = "; ".join(what for what, is_barred in barred.items() if is_barred)
     return eased, [f"sprayed here though [safety] bars it: {said}"] * bool(said)
+
+
+def _modes(flight: Recorded) -> set[str]:
+    return {held(flight.modes, at_s, "UNKNOWN") for at_s in flight.states.time_s.tolist()}
 
 
 def heard(bed: Bed, seed: int) -> Iterator[Input]:
@@ -497,6 +500,7 @@ def fly_along(options: AlongOptions, say: Callable[[str], None]) -> dict[str, An
         "recorded_rate_hz": round(bed.flight.rate_hz, 2),
         "flown_s": float(np.ptp(bed.path.time_s)),
         "speed_m_s": _usual_m_s(bed.path),
+        "modes": sorted(_modes(bed.flight)),
         "plant": bed.profile.name,
         "flights": len(beds),
         "methods": rows,
