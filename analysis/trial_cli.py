@@ -16,6 +16,7 @@ import typer
 
 from companion.atomic_write import write_atomically
 from companion.cli.answer import AsJson, answer, note
+from companion.csv_table import csv_of
 from companion.errors import VrsprayError
 from companion.wording import counted, install_command
 
@@ -360,12 +361,9 @@ def _line(one: Achieved, half: float) -> str:
 
 
 def _write_table(path: Path, rows: Sequence[dict[str, Any]]) -> None:
-    text = StringIO()
-    table = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
-    table.writeheader()
-    table.writerows({**row, "failed": "; ".join(row["failed"])} for row in rows)
+    text = csv_of([{**row, "failed": "; ".join(row["failed"])} for row in rows])
     try:
-        write_atomically(path, text.getvalue().encode())
+        write_atomically(path, text.encode())
     except OSError as error:
         raise TrialError(f"{path}: cannot be written ({error.strerror or error})") from None
 

@@ -7,6 +7,7 @@ import itertools
 import json
 import os
 import shutil
+import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -21,6 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from companion.cli.answer import AsJson, answer, note, progress
+from companion.cli.terminal import terminal, visible
 from companion.errors import ConfigError
 from companion.wording import install_command
 from sitl.cli import FlowLaw
@@ -188,14 +190,16 @@ def _move(names: Sequence[str], stage: Path, out: Path) -> None:
 def _print(result: DemoResult, paths: Sequence[Path]) -> None:
     from sitl.demo_page import legend_lines, sentence
 
-    console = Console(highlight=False)
+    console = Console(highlight=False, file=terminal(sys.stdout))
     if not console.is_terminal:
-        console = Console(highlight=False, width=WIDTH)
+        console = Console(highlight=False, width=WIDTH, file=terminal(sys.stdout))
     console.print(_table(result, padding=1 if console.width >= WIDE else 0))
     for line in (*legend_lines(), ""):
         console.print(line, style="dim")
     console.print(sentence(result))
-    console.print(f"Files in {paths[0].parent}{os.sep}: {', '.join(path.name for path in paths)}")
+    console.print(
+        visible(f"Files in {paths[0].parent}{os.sep}: {', '.join(path.name for path in paths)}")
+    )
 
 
 def _table(result: DemoResult, *, padding: int) -> Table:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from analysis.exports.columns import Column, Unit, plain_names, valve_columns
 from analysis.strips import strips_of
+from companion.csv_table import cell
 
 if TYPE_CHECKING:
     from analysis.exports.output import Content
@@ -63,9 +64,10 @@ def csv_of(columns: Sequence[Column]) -> Iterator[bytes]:
 def quoted(text: str) -> str:
     """Return a text as a field of a table.
 
-    >>> quoted('a "b", c'), quoted("plain")
-    ('"a ""b"", c"', 'plain')
+    >>> quoted('a "b", c'), quoted("plain"), quoted("=1+1")
+    ('"a ""b"", c"', 'plain', "'=1+1")
     """
+    text = str(cell(text))
     if any(sign in text for sign in ',"\r\n'):
         return '"' + text.replace('"', '""') + '"'
     return text

@@ -21,6 +21,7 @@ import pyarrow.parquet as pq
 
 from analysis.fleet.store import DAMAGED_SCHEMA, STORE_ERRORS, TRIES
 from companion.atomic_write import write_atomically
+from companion.csv_table import cell
 from companion.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -162,15 +163,17 @@ def _as_json(value: Any) -> Any:
 def csv_of(table: pa.Table) -> bytes:
     """Return a table as CSV; what is a list in it is JSON in its cell."""
     columns = [
-        pa.array(
-            [None if each is None else json.dumps(_as_json(each)) for each in column.to_pylist()]
+        column
+        if pa.types.is_primitive(column.type)
+        else pa.array(
+            cell(json.dumps(_as_json(each)) if isinstance(each, list | dict) else each)
+            for each in column.to_pylist()
         )
-        if pa.types.is_nested(column.type)
-        else column
         for column in table.columns
     ]
     sink = io.BytesIO()
-    pa_csv.write_csv(pa.table(columns, names=table.column_names), sink)
+    names = [str(cell(name)) for name in table.column_names]
+    pa_csv.write_csv(pa.table(columns, names=names), sink)
     return sink.getvalue()
 
 

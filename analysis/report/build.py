@@ -8,8 +8,6 @@ the page can be printed on any other computer.
 from __future__ import annotations
 
 import base64
-import csv
-import io
 import json
 import math
 import os
@@ -35,6 +33,7 @@ from analysis.report.legal import LegalRecord, legal_record
 from analysis.report.legal_fields import Told, facts_of, told_with
 from analysis.report.treated import Clock, Treated, clock_of, duration_text, treated_of
 from companion.config.application_table import PROFILES, Profile
+from companion.csv_table import csv_of
 from companion.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -339,11 +338,7 @@ def record_csv(record: LegalRecord) -> bytes:
     row["remarks"] = "; ".join(record.remarks)
     area = shapely.from_geojson(json.dumps(record.treated_area))
     row["treated_area_wkt"] = shapely.to_wkt(area, rounding_precision=7)
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, fieldnames=list(row))
-    writer.writeheader()
-    writer.writerow(row)
-    return text.getvalue().encode()
+    return csv_of([row]).encode()
 
 
 # Chromium and what is made of it; all take the same options.

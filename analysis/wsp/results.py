@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from io import StringIO
 from typing import Any
 
 import numpy as np
@@ -19,6 +17,7 @@ from analysis.wsp.card import (
     SheetResult,
 )
 from analysis.wsp.stains import LAW, LEAST_DROP_UM, UNRELIABLE_PERCENT, second_of
+from companion.csv_table import csv_of
 
 # Columns of a card's figures, in the order of CSV; those of the second spread factor follow.
 SIZES = (
@@ -177,13 +176,7 @@ def sheet_row(sheet: SheetResult, cards: Sequence[Numbered], picture: str | None
 
 def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return the cards as a table, a row a card; what is not known is blank."""
-    flat = [_flat(row) for row in rows]
-    names = list(dict.fromkeys(name for row in flat for name in row))
-    out = StringIO()
-    writer = csv.DictWriter(out, names, lineterminator="\n", restval="")
-    writer.writeheader()
-    writer.writerows(flat)
-    return out.getvalue()
+    return csv_of([_flat(row) for row in rows])
 
 
 def _flat(row: Mapping[str, Any]) -> Row:

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
+from companion.cli.terminal import Styled, terminal, visible
+
 if TYPE_CHECKING:
     from rich.progress import Progress
 
@@ -33,7 +35,7 @@ def answer(result: Mapping[str, Any], lines: Iterable[str], *, as_json: bool) ->
         typer.echo(json.dumps(_finite(result), allow_nan=False))
         return
     for line in lines:
-        typer.echo(line)
+        typer.echo(line, file=terminal(sys.stdout) if isinstance(line, Styled) else None)
 
 
 def note(line: str) -> None:
@@ -141,13 +143,13 @@ def progress(*, quiet: bool = False, after_s: float = 0.0) -> Iterator[Tell]:
                 if time.monotonic() < seen_s:
                     return
                 bars.append(shown.enter_context(_bar()))
-                bars[0].add_task(what, total=total)
+                bars[0].add_task(visible(what), total=total)
             bar = bars[0]
             (task,) = bar.tasks
             if task.total != total or done < task.completed:
                 # A count that begins anew is another piece of work: so does its time.
-                bar.reset(task.id, total=total, description=what)
-            bar.update(task.id, description=what, completed=done, total=total)
+                bar.reset(task.id, total=total)
+            bar.update(task.id, description=visible(what), completed=done, total=total)
 
         yield tell
 
@@ -165,13 +167,13 @@ def _bar() -> Progress:
     )
 
     return Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
-        console=Console(stderr=True),
+        console=Console(file=terminal(sys.stderr)),
         transient=True,
         refresh_per_second=REFRESHED_HZ,
     )

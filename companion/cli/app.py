@@ -27,6 +27,7 @@ from typer._click.exceptions import NoArgsIsHelpError
 from typer.core import TyperArgument, TyperCommand, TyperGroup, TyperOption
 
 from companion.cli.beside import give_way
+from companion.cli.terminal import shown_as_text
 from companion.commands import Command, Haste, all_registered, command_named, load, registered
 from companion.errors import (
     NOT_ENOUGH_MEMORY,
@@ -262,7 +263,12 @@ def _haste(arguments: Sequence[str]) -> Haste:
 
 
 def execute(arguments: Sequence[str]) -> int:
-    """Run one command and return its exit code."""
+    """Run one command and return its exit code; what it says can do nothing to the terminal."""
+    with shown_as_text():
+        return _executed(arguments)
+
+
+def _executed(arguments: Sequence[str]) -> int:
     as_json = "--json" in arguments
     try:
         result = typer.main.get_command(app).main(

@@ -21,6 +21,7 @@ from companion.cli.output_parts import build_link, engine_setup, load_with_kept,
 from companion.cli.run import component_options
 from companion.cli.sensor_parts import build_sensors
 from companion.cli.systemd import is_ours, properties, quoted, read_unit, unit_path, watchdog_is_on
+from companion.cli.terminal import Styled, visible
 from companion.config import Config
 from companion.config.rules import mismatches, without_effect
 from companion.core.setup import Setup
@@ -213,7 +214,8 @@ def _in_order(checks: list[Check]) -> Iterator[str]:
     """Yield the checks, the worst last and in colour, where a terminal still shows it."""
     for check in sorted(checks, key=lambda check: _ORDER.index(check.status)):
         colour = None if "NO_COLOR" in os.environ else _COLOURS.get(check.status)
-        yield check.line() if colour is None else typer.style(check.line(), fg=colour)
+        line = check.line()
+        yield line if colour is None else Styled(typer.style(visible(line), fg=colour))
 
 
 def _summary(checks: list[Check]) -> str:

@@ -12,6 +12,7 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 from companion.cli.live import Shown
+from companion.cli.terminal import visible
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -42,7 +43,7 @@ def drawn(shown: Shown, *, silent_s: float = 0.0) -> RenderableType:
             style = _COLOURS.get(shown.state, "bold yellow")
         elif label == "training" or (label == "faults" and shown.faults):
             style = "bold red"
-        table.add_row(label, Text(text, style=style))
+        table.add_row(label, Text(visible(text), style=style))
     title = "vrspray"
     if silent_s > STALE_S:
         title = f"vrspray: NOTHING NEW FOR {silent_s:.0f} s"
@@ -75,7 +76,7 @@ def main(source: int = 0) -> None:
                 *lines, left = (left + got).split(b"\n")
                 for content in map(json.loads, lines):
                     if "line" in content:
-                        console.print(content["line"], markup=False)
+                        console.print(visible(content["line"]), markup=False)
                     elif content:
                         shown, heard_s = shown_of(content), time.monotonic()
             live.update(drawn(shown, silent_s=time.monotonic() - heard_s), refresh=True)

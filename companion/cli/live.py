@@ -23,6 +23,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from companion.cli.terminal import visible
 from companion.core.frame import Floats
 from companion.core.types import Decision
 from companion.tally import SPEED_MIN_M_S, Tally, next_change_s, speed_of, wanted_l_ha
@@ -372,4 +373,4 @@ class _Lines:
 def _print(text: str) -> None:
     """Write a line before the loop begins or after it has ended: it may wait."""
     with contextlib.suppress(OSError):
-        os.write(2, (text + "\n").encode(errors="replace"))
+        os.write(2, (visible(text) + "\n").encode(errors="replace"))

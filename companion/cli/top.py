@@ -20,6 +20,7 @@ import typer
 from companion.cli.answer import AsJson, answer, note
 from companion.cli.drawing import drawn
 from companion.cli.live import DRAWN_EVERY_S, PLAIN_EVERY_S, Shown
+from companion.cli.terminal import terminal
 from companion.core.types import SprayerState
 from companion.errors import LinkError
 from companion.link.census import AUTOPILOT_COMPONENT, mode_name
@@ -266,9 +267,14 @@ class _Block:
     """One block on the terminal."""
 
     def __init__(self) -> None:
+        from rich.console import Console
         from rich.live import Live
 
-        self._live = Live(drawn(Shown(state="no companion heard")), auto_refresh=False)
+        self._live = Live(
+            drawn(Shown(state="no companion heard")),
+            console=Console(file=terminal(sys.stdout)),
+            auto_refresh=False,
+        )
 
     def __enter__(self) -> None:
         self._live.__enter__()

@@ -7,8 +7,6 @@ map readers.
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -20,6 +18,7 @@ import shapely
 from pyproj import CRS, Transformer
 
 from companion.core.frame import LocalFrame
+from companion.csv_table import csv_text
 from companion.errors import MapError
 from companion.map_formats import geojson_feature, geojson_text
 from missions.make.cleaning import (
@@ -346,13 +345,11 @@ def write_points(path: Path, points: Points) -> None:
     rows = zip(points.degrees.tolist(), *(points.columns[name].tolist() for name in names),
                strict=True)  # fmt: skip
     if path.suffix.casefold() == ".csv":
-        text = io.StringIO()
-        table = csv.writer(text, lineterminator="\n")
-        table.writerow(["lat", "lon", *names])
+        table: list[list[str]] = [["lat", "lon", *names]]
         for (lon, lat), *values in rows:
             shown = ["" if math.isnan(value) else repr(value) for value in values]
-            table.writerow([f"{lat:.8f}", f"{lon:.8f}", *shown])
-        write_whole(path, text.getvalue().encode("utf-8"))
+            table.append([f"{lat:.8f}", f"{lon:.8f}", *shown])
+        write_whole(path, csv_text(table).encode("utf-8"))
         return
     features = [
         geojson_feature(
