@@ -433,10 +433,15 @@ def precise_event_loop() -> asyncio.AbstractEventLoop:
     return asyncio.SelectorEventLoop(selectors.SelectSelector())
 
 
-def execute(start: Callable[[], Coroutine[Any, Any, T]]) -> T:
-    """Run `start()` on a precise event loop, with what exists by now out of the collector's way."""
+def settle() -> None:
+    """Have what exists by now out of the collector's way."""
     gc.collect()
     gc.freeze()
+
+
+def execute(start: Callable[[], Coroutine[Any, Any, T]]) -> T:
+    """Run `start()` on a precise event loop."""
+    settle()
     # The journal's thread gives the interpreter back within this, not within 5 ms: an order that
     # is due does not wait for it.
     sys.setswitchinterval(SWITCH_S)

@@ -251,15 +251,23 @@ def servo_options(config: Config) -> ServoOptions | None:
 
 def build_servo(config: Config, options: ServoOptions, link: VehicleLink) -> ServoExecutor:
     """Return the executor of these outputs; it hears what the vehicle says of them."""
-    from companion.output.servo import ServoExecutor
+    from companion.output.guarded import NOTE_NAME, GuardedServoExecutor, GuardianSetup
 
-    executor = ServoExecutor(
+    guardian = GuardianSetup(
+        lease_s=config.output.lease_s,
+        component=config.link.component_id,
+        is_udp=config.link.url.startswith("udp"),
+        key=link.signing_key,
+        note=config.resolve(config.link.state_folder) / NOTE_NAME,
+    )
+    executor = GuardedServoExecutor(
         options,
         link.order,
+        guardian,
+        link.way,
         flush=link.flush_orders,
         say=link.note_outputs,
         baud=serial_baud(config.link.url),
-        is_signed=config.link.signing_key_file is not None,
     )
     link.on_order_ack(executor.acknowledge)
     link.follow_outputs(executor)

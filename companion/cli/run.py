@@ -19,7 +19,13 @@ from companion.assembly import build_setup, deliverable, flight_map_of, refuse_m
 from companion.cli.answer import AsJson, Overrides, answer, note
 from companion.cli.beside import shown
 from companion.cli.live import Screen, Watcher
-from companion.cli.output_parts import build_link, build_outputs, line_warnings, load_with_kept
+from companion.cli.output_parts import (
+    build_link,
+    build_outputs,
+    line_warnings,
+    load_with_kept,
+    servo_options,
+)
 from companion.cli.record_parts import FREE_MIN_BYTES, follow, made_ready
 from companion.config import Config
 from companion.config.application_table import told
@@ -80,54 +86,45 @@ def run_companion(
     config, given = load_with_kept(config_file, wanted)
     training = training_mark(config)
     refuse_mismatch(config)
-    flight_map = flight_map_of(config, given)
-    setup = build_setup(config, flight_map)
-    simulated = _simulated_lines(continue_from)
-    if continue_from:
-        setup = _resumed(setup, continue_from, config, training, takes_unmarked=takes_unmarked)
-    for line in (*_guard_lines(setup), *simulated):
-        note(line)
     link = build_link(config, given, component_options(config, training=training))
     executor = build_executor(config, link)
-    sensors = _sensors(config, link)
-    page = _page(config, given, setup, link, training=training)
-    _note_what_may_surprise(config, setup, training)
-    commit_s = config.journal.commit_s or commit_every_s(
-        setup, None if config.mission is None else config.mission.speed_m_s
-    )
-    about = _about(config, given, flight_map)
-    journal = _new_journal(config, setup, about, training=training, commit_s=commit_s)
-    follow(journal, link, executor)
-    recorder = _recorder(page, journal, link)
-    notifier = _notifier()
-    try:
-        screen.watcher = _watcher(
-            config, setup, training, lambda: (executor.fault, link.fault, journal.fault)
-        )
-        with journal, notifier or nullcontext(), shown(), screen:
-            runtime.execute(
-                lambda: runtime.run(
-                    setup,
-                    link=link,
-                    executor=executor,
-                    recorder=recorder,
-                    sensors=sensors if page is None else [*sensors, page],
-                    duration_s=duration_s,
-                    on_step=None if notifier is None else notifier.stepped,
-                    watch=screen.take,
-                    required=(
-                        (journal, config.journal.close_after_s) if config.journal.required else None
-                    ),
-                    commit_every_s=commit_s,
-                )
-            )
-    except (ActuatorError, LinkError, SensorError):
-        # Without link, outputs or sensors the run ends before its first step: no flight to keep.
-        from companion.journal.reader import is_empty
 
-        if is_empty(journal.path):
-            journal.path.unlink()
-        raise
+    def made() -> tuple[FlightMap, Setup]:
+        flight_map = flight_map_of(config, given)
+        setup = build_setup(config, flight_map)
+        lines = _guard_lines(setup)
+        if continue_from:
+            from companion.journal.continuing import continued, simulated_lines
+
+            setup = continued(
+                setup,
+                continue_from,
+                training=training,
+                takes_unmarked=takes_unmarked,
+                by_default=config.coverage.switch_off_percent is None,
+            )
+            lines = [*_guard_lines(setup), *simulated_lines(continue_from)]
+        for line in lines:
+            note(line)
+        return flight_map, setup
+
+    async def flown() -> Journal:
+        try:
+            if servo_options(config) is None:
+                flight_map, setup = made()
+            else:
+                from companion.cli.guarded_parts import meanwhile
+
+                flight_map, setup = await meanwhile(made, link, executor)
+            about = _about(config, given, flight_map)
+            page = _page(config, given, setup, link, training=training)
+            return await _fly(config, setup, about, link, executor, page, screen, duration_s)
+        finally:
+            await executor.stop()
+            await link.close()
+
+    with shown(), screen:
+        journal = runtime.execute(flown)
     kept, line = _kept(journal.path, link)
     answer(
         {"journal": kept, "lost_rows": journal.lost, "training": training},
@@ -136,28 +133,55 @@ def run_companion(
     )
 
 
-def _resumed(
-    setup: Setup, journals: Sequence[Path], config: Config, training: str, *, takes_unmarked: bool
-) -> Setup:
-    """Return the set-up with the ground that the flights of these journals treated."""
-    from companion.journal.continuing import continued
-
-    return continued(
-        setup,
-        journals,
-        training=training,
-        takes_unmarked=takes_unmarked,
-        by_default=config.coverage.switch_off_percent is None,
+async def _fly(
+    config: Config,
+    setup: Setup,
+    about: Mapping[str, str],
+    link: VehicleLink,
+    executor: PlanExecutor,
+    page: OperatorPage | None,
+    screen: Screen,
+    duration_s: float | None,
+) -> Journal:
+    """Run until the end of the flight, and return its journal."""
+    training = training_mark(config)
+    sensors = _sensors(config, link)
+    _note_what_may_surprise(config, setup, training)
+    commit_s = config.journal.commit_s or commit_every_s(
+        setup, None if config.mission is None else config.mission.speed_m_s
     )
+    journal = _new_journal(config, setup, about, training=training, commit_s=commit_s)
+    follow(journal, link, executor)
+    recorder = _recorder(page, journal, link)
+    notifier = _notifier()
+    screen.watcher = _watcher(
+        config, setup, training, lambda: (executor.fault, link.fault, journal.fault)
+    )
+    runtime.settle()
+    try:
+        with journal, notifier or nullcontext():
+            await runtime.run(
+                setup,
+                link=link,
+                executor=executor,
+                recorder=recorder,
+                sensors=sensors if page is None else [*sensors, page],
+                duration_s=duration_s,
+                on_step=None if notifier is None else notifier.stepped,
+                watch=screen.take,
+                required=(
+                    (journal, config.journal.close_after_s) if config.journal.required else None
+                ),
+                commit_every_s=commit_s,
+            )
+    except (ActuatorError, LinkError, SensorError):
+        # Without outputs or sensors the run ends before its first step: no flight to keep.
+        from companion.journal.reader import is_empty
 
-
-def _simulated_lines(journals: Sequence[Path] | None) -> Sequence[str]:
-    """Return which of the journals that are gone on from are of a simulated flight."""
-    if not journals:
-        return ()
-    from companion.journal.continuing import simulated_lines
-
-    return simulated_lines(journals)
+        if is_empty(journal.path):
+            journal.path.unlink()
+        raise
+    return journal
 
 
 def _note_what_may_surprise(config: Config, setup: Setup, training: str) -> None:

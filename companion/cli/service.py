@@ -13,7 +13,12 @@ from typing import Annotated, Any
 import typer
 
 from companion.cli.answer import AsJson, answer
-from companion.cli.output_parts import engine_setup, motor_closer_arguments, pwm_drives
+from companion.cli.output_parts import (
+    engine_setup,
+    motor_closer_arguments,
+    pwm_drives,
+    servo_options,
+)
 from companion.cli.systemd import (
     NAME,
     ServiceError,
@@ -145,6 +150,7 @@ def build_unit(config: Config, *, is_user: bool, account: str, is_realtime: bool
             groups=tuple(group for group in _GROUPS if _exists(group)),
             is_realtime=is_realtime,
             writes_sysfs=bool(pwm_drives(config)),
+            is_guarded=servo_options(config) is not None,
         )
     except ValueError as error:
         raise ServiceError(f"{config.path}: {error}") from error

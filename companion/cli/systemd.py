@@ -157,7 +157,8 @@ class Unit:
     """What the template leaves open; paths are absolute.
 
     `closer` are the arguments of the independent closer, empty where no valve hangs on this
-    computer's lines. `account` and `groups` are for a system's unit only.
+    computer's lines; `is_guarded` where some hang on the autopilot. `account` and `groups` are for
+    a system's unit only.
     """
 
     python: str
@@ -168,6 +169,7 @@ class Unit:
     account: str = ""
     groups: tuple[str, ...] = ()
     is_realtime: bool = False
+    is_guarded: bool = True
     writes_sysfs: bool = False
 
     def text(self) -> str:
@@ -176,6 +178,7 @@ class Unit:
         filled = template.format(
             start=command(self.python, "-P", "-m", "companion", "run", "--config", self.config),
             closer=self._closer(),
+            ending=self._ending(),
             account="" if self.is_user else self._account(),
             realtime=self._realtime(),
             sandbox="" if self.is_user else self._sandbox(),
@@ -192,8 +195,21 @@ class Unit:
             f"ExecStopPost={close}"
         )
 
+    def _ending(self) -> str:
+        if not self.is_guarded:
+            return (
+                "# The companion stops its valve engine by itself; what is left of it is killed.\n"
+                "KillMode=mixed"
+            )
+        return (
+            "# After a crash the guardian, at SIGTERM, closes the servo outputs for 2 s more.\n"
+            "KillMode=control-group"
+        )
+
     def _account(self) -> str:
         lines = [f"User={self.account}"] if self.account else []
+        lines.append("# Short of memory, Linux ends other programs first, and the guardian last.")
+        lines.append("OOMScoreAdjust=-500")
         if self.groups:
             lines.append(f"SupplementaryGroups={' '.join(self.groups)}")
         return "\n".join(lines)

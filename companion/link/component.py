@@ -282,6 +282,10 @@ class Component:
             self._timesync_s = now_s
             self._send(self._encoder.timesync(0, self._ask_time(now_s)))
 
+    def starting(self, is_starting: bool) -> None:
+        """Take whether nobody decides yet: then nobody can enable."""
+        self._command_state.is_starting = is_starting
+
     def link_changed(self, now_s: float) -> None:
         """Ask for the streams anew: whoever answers now may not have heard us before."""
         if self.is_vehicle_known:

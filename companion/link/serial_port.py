@@ -57,7 +57,7 @@ class SerialTransport(Reconnecting):
         with contextlib.suppress(OSError, ValueError, NotImplementedError):
             # Adapters of USB collect bytes for 16 ms otherwise; others do not know the setting.
             port.set_low_latency_mode(True)
-        self._port = port
+        self._port = self.handle = port
         self._pending.clear()
         asyncio.get_running_loop().add_reader(port.fileno(), self._readable)
 
@@ -105,7 +105,7 @@ class SerialTransport(Reconnecting):
 
     def _drop(self) -> None:
         """Let the device go, which must happen before it can be opened again."""
-        port, self._port = self._port, None
+        port, self._port, self.handle = self._port, None, None
         if port is None:
             return
         loop = asyncio.get_running_loop()

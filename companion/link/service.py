@@ -75,6 +75,7 @@ class CommandState:
     values_hz: float = 1.0
     is_armed: bool = False
     is_open: bool = False
+    is_starting: bool = False
     may_enable: bool = True  # a command may; below, the page may
     page_may_enable: bool = False
     is_enabled: bool = False
@@ -156,8 +157,9 @@ def _without_enabling(command_state: CommandState, command: CommandReceived) -> 
         return Answer(result=DENIED, text="enable by command: see safety.enable_by")
     if command.target_system == 0:
         return Answer(result=DENIED, text="enable: name this vehicle's system, not 0")
-    if command_state.is_old(command):
-        return Answer(result=REJECTED_FOR_NOW, text="late enable not taken: enable again")
+    if command_state.is_starting or command_state.is_old(command):
+        when = "starting:" if command_state.is_starting else "late"
+        return Answer(result=REJECTED_FOR_NOW, text=f"{when} enable not taken: enable again")
     if command_state.signing is None or command.source != "command":
         return None
     return _unless_admitted(command_state, command_state.signing)

@@ -162,6 +162,11 @@ class Signing:
     def _now(self) -> int:
         return _stamp_at(self._clock())
 
+    @property
+    def stamp(self) -> int:
+        """Return the last stamp that was given or learnt."""
+        return self._stamp
+
     def next_stamp(self) -> int:
         """Return a stamp that was never given before."""
         self._stamp = max(self._stamp + 1, self._now())

@@ -10,7 +10,7 @@ import asyncio
 import errno
 import socket
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
@@ -34,6 +34,11 @@ class Transport(Protocol):
 
     is_up: bool
     speaker: Any  # where the bytes that are being handed over came from, where there are several
+    handle: Any  # what is sent by, which has a `fileno`; None while the link is down
+
+    @property
+    def peers(self) -> Sequence[Any]:
+        """Return the addresses that are sent to; none where there is one other end."""
 
     def send(self, data: bytes) -> bool:
         """Send now or not at all; return whether it left."""
@@ -96,6 +101,8 @@ class Reconnecting:
         self.url = url
         self.is_up = False
         self.speaker: Any = None
+        self.handle: Any = None
+        self.peers: Sequence[Any] = ()
         self._on_bytes = on_bytes
         self._on_change = on_change
         self._on_trouble = on_trouble
@@ -198,6 +205,7 @@ class UdpTransport(asyncio.DatagramProtocol):
         self._is_connected = is_connected
         self._peers: dict[Any, _Peer] = {}
         self.speaker: Any = None
+        self.handle: Any = None
         self._socket: asyncio.DatagramTransport | None = None
         self._closed = asyncio.get_running_loop().create_future()
         self.is_up = True
@@ -207,11 +215,17 @@ class UdpTransport(asyncio.DatagramProtocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Take the socket over."""
         self._socket = cast(asyncio.DatagramTransport, transport)
+        self.handle = transport.get_extra_info("socket")
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
         """Hand the bytes over; `speaker` says meanwhile where they came from."""
         self.speaker = addr
         self._on_bytes(data)
+
+    @property
+    def peers(self) -> Sequence[Any]:
+        """Return the addresses that were adopted."""
+        return tuple(self._peers)
 
     def adopt(self, speaker: Any, now_s: float, *, is_vehicle: bool) -> None:
         """Send to an address from now on, if there is a place for it."""
@@ -293,7 +307,8 @@ async def open_udp(url: LinkUrl, on_bytes: OnBytes) -> UdpTransport:
             remote_addr=None if listens else address,
         )
     except OSError as error:
-        raise LinkError(f"link.url = {url.text!r}: {_reason(url, error)}") from error
+        kind = LinkNotYetError if error.errno == errno.EADDRINUSE else LinkError
+        raise kind(f"link.url = {url.text!r}: {_reason(url, error)}") from error
     return transport
 
 
@@ -370,12 +385,12 @@ class TcpTransport(Reconnecting):
             raise LinkNotYetError(f"link.url = {self.url.text!r}: the other end hung up at once")
         tcp: socket.socket = transport.get_extra_info("socket")
         tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _UNANSWERED_MS)
-        self._transport, self._connection = transport, connection
+        self._transport, self._connection, self.handle = transport, connection, tcp
 
     def connection_ended(self, connection: _Connection) -> None:
         """Take the end of a connection; only that of the present one matters."""
         if connection is self._connection:
-            self._transport = None
+            self._transport = self.handle = None
             self._lost()
 
     def send(self, data: bytes) -> bool:

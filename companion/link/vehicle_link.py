@@ -45,6 +45,7 @@ _logger = logging.getLogger(__name__)
 # Chunks that wait for the control loop. It empties them within a millisecond; a loop that is
 # behind by this many has other troubles than the oldest bytes.
 _CHUNKS_MAX = 512
+_KEPT_MAX = 50_000
 _STATISTICS_S = 60.0
 _SAMPLE_S = 1.0
 
@@ -76,6 +77,8 @@ class VehicleLink:
         self.component.on_event = self._event
         self.component.on_valid = self._adopt
         self._on_event: OnEvent | None = None
+        self._early: deque[tuple[float, str, str]] = deque(maxlen=_CHUNKS_MAX)
+        self._kept: list[Input] = []
         self._on_statistics: OnStatistics | None = None
         self._sampled_s = float("-inf")
         self._watch = Watch(url, self.component, self._event)
@@ -100,8 +103,13 @@ class VehicleLink:
         return None if finding is None else finding.text
 
     async def open(self, wake: Callable[[], None]) -> None:
-        """Open the link, or begin to try where waiting can help; raises a `LinkError`."""
+        """Open the link, or begin to try where waiting can help; raises a `LinkError`.
+
+        One that is open stays so, and wakes another from now on.
+        """
         self._wake = wake
+        if self._transport is not None:
+            return
         self._transport = await open_transport(
             self._url, self._on_bytes, self._on_change, self._on_trouble
         )
@@ -118,6 +126,9 @@ class VehicleLink:
     def on_event(self, take: OnEvent) -> None:
         """Have what happens on the link given to `take(at_s, kind, text)`, for the record."""
         self._on_event = take
+        for event in self._early:
+            take(*event)
+        self._early.clear()
 
     def on_statistics(self, take: OnStatistics) -> None:
         """Have how the link does given to `take(at_s, values)` once a second, for the record."""
@@ -128,7 +139,7 @@ class VehicleLink:
         if self._changed:
             self._changed = False
             self.component.link_changed(self._clock())
-        inputs: list[Input] = []
+        inputs, self._kept = self._kept, []
         while self._chunks:
             data, received_s, speaker = self._chunks.popleft()
             self._spoke = (speaker, received_s)
@@ -137,6 +148,17 @@ class VehicleLink:
             not isinstance(item, OperatorCommand | RateOverride) for item in inputs
         )
         return inputs
+
+    def attend(self) -> None:
+        """Take what comes before anybody decides; it is kept for `receive`.
+
+        We speak only where nobody speaks to us before: who hears us may think that we are ready.
+        """
+        self.component.starting(True)
+        self._kept = self.receive()[-_KEPT_MAX:]
+        self.component.starting(False)
+        if self._url.startswith("udpout:"):
+            self.tell(None, self._clock())
 
     def on_refilled(self, take: Callable[[float], bool]) -> None:
         """Have the operator's fillings given to `take(litres)`, which says whether it can be."""
@@ -183,6 +205,17 @@ class VehicleLink:
     def follow_outputs(self, listener: OutputListener) -> None:
         """Have all that the vehicle says of its outputs given to who orders them."""
         self.component.outputs.listener = listener
+
+    def way(self) -> tuple[Any, dict[str, Any]]:
+        """Return by what the vehicle is reached now, and as whom, for one who closes for us."""
+        transport, stamp = self._transport, 0 if self._signing is None else self._signing.stamp
+        handle, peers = (None, ()) if transport is None else (transport.handle, transport.peers)
+        return handle, {"peers": peers, "system": self.component.address[0], "stamp": stamp}
+
+    @property
+    def signing_key(self) -> bytes:
+        """Return the key that the link is signed with; empty where it is not."""
+        return b"" if self._signing is None else self._signing.key
 
     def note_outputs(self, text: str) -> None:
         """Tell operator, log and record of something about the outputs that should be seen to."""
@@ -251,6 +284,8 @@ class VehicleLink:
             _logger.info("simulated vehicle: %s", text)
         if self._on_event is not None:
             self._on_event(at_s, kind, text)
+        else:
+            self._early.append((at_s, kind, text))
 
     def _keep_count(self, now_s: float) -> None:
         """Write statistics down once a minute, and the signing stamp when it is due."""

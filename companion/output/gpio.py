@@ -10,22 +10,19 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-import os
-import socket
-import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 from companion.core.types import SprayPlan
 from companion.errors import ActuatorError
+from companion.output.child import Child
 from companion.output.engine.lines import Lines, open_lines
 from companion.output.engine.selftest import SelfTest
 from companion.output.engine.wire import (
-    PACKET_MAX,
     EngineSetup,
     Issued,
     Kind,
@@ -39,77 +36,9 @@ from companion.output.engine.wire import (
 )
 from companion.output.timed import Lateness, OnOrder
 
-# The engine's process as the companion has it: start, packets to it, its end.
-
 # -P: a module of the working directory is none of ours, whatever its name. Not -I, which would
 # also leave out a user's own site-packages, where this program may be installed.
 COMMAND = (sys.executable, "-P", "-m", "companion.output.engine")
-KILL_MAX_S = 0.1
-
-
-class EngineChild:
-    """A child process and the socket to it. No threads and no shell; `reap` must be called."""
-
-    def __init__(self, command: Sequence[str]) -> None:
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with ExitStack() as on_failure, theirs:
-            on_failure.enter_context(ours)
-            file = theirs.fileno()
-            self._process = subprocess.Popen(
-                [*command, str(file), str(os.getpid())],
-                pass_fds=(file,),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                # Linux shares the processor among sessions first: in ours, a busy companion would
-                # leave the engine's wake-ups a twentieth of a processor that others want as well.
-                start_new_session=True,
-            )
-            on_failure.pop_all()
-        ours.setblocking(False)
-        self.socket = ours
-        self.is_connected = True
-
-    @property
-    def pid(self) -> int:
-        """Return the process id."""
-        return self._process.pid
-
-    def send(self, packet: bytes) -> bool:
-        """Hand over a packet; False if its socket is full, or it is gone."""
-        try:
-            self.socket.send(packet, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
-        except OSError:
-            return False
-        return True
-
-    def packets(self) -> Iterator[bytes]:
-        """Yield what it sent; an empty packet is its end."""
-        while self.is_connected:
-            try:
-                packet = self.socket.recv(PACKET_MAX)
-            except BlockingIOError:
-                return
-            except OSError:
-                packet = b""
-            yield packet
-            if not packet:
-                return
-
-    def disconnect(self) -> None:
-        """Close the socket, which ends an engine that is well."""
-        self.is_connected = False
-        self.socket.close()
-
-    def kill(self) -> None:
-        """End it whatever it does; the kernel releases its lines."""
-        self._process.kill()
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(KILL_MAX_S)
-
-    def reap(self) -> None:
-        """Wait for an end that is under way."""
-        self._process.wait()
-
 
 _logger = logging.getLogger(__name__)
 
@@ -147,7 +76,7 @@ class GpioExecutor:
         self._count = len(setup.wiring.valves)
         self._command = tuple(command)
         self._late_max_s = late_max_s
-        self._child: EngineChild | None = None
+        self._child: Child | None = None
         self._held = HeldLines(setup)
         self._timer: asyncio.TimerHandle | None = None
         self._ready, self._ended = asyncio.Event(), asyncio.Event()
@@ -191,7 +120,7 @@ class GpioExecutor:
             ActuatorError: no engine answers at all.
         """
         loop = asyncio.get_running_loop()
-        self._child = EngineChild(self._command)
+        self._child = Child(self._command)
         loop.add_reader(self._child.socket, self._read)
         self._send(pack(Kind.SETUP, self._setup.as_bytes()))
         try:

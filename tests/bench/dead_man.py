@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import shutil
+import signal
 import sys
 import tempfile
 import time
@@ -39,6 +41,12 @@ class Closing:
     script_s: float
     script_after_life_s: float
     board_s: float
+
+
+def children_of(pid: int) -> list[int]:
+    """Return the processes that a process has started, such as its guardian."""
+    lists = Path(f"/proc/{pid}/task").glob("*/children")
+    return [int(child) for each in lists for child in each.read_text().split()]
 
 
 def frames_of(data: bytes) -> Iterator[bytes]:
@@ -156,13 +164,15 @@ async def _fly_and_kill(
 
     peer.feed = listen  # type: ignore[method-assign]
     async with over_udp(peer, port):
-        await peer.until(lambda: peer.is_all_closed, within_s=30.0)
+        await peer.until(lambda: peer.is_ready, within_s=30.0)
         peer.place(east_m=-6.0)
         peer.enable()
         await peer.until(lambda: len(peer.open_channels) == len(peer.outputs))
         await asyncio.sleep(float(np.random.default_rng(seed).uniform(0.3, 0.8)))
         # On a busy computer the script may just have closed what was silent for too long.
         await peer.until(lambda: layers.are_all_open)
+        for child in children_of(process.pid):  # the guardian: no layer beside this computer
+            os.kill(child, signal.SIGKILL)
         process.kill()
         killed_s = layers.now_s()
         await process.wait()

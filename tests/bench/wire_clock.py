@@ -30,6 +30,7 @@ from missions.maps.compiling import compiled_setup
 from sitl.serve import ServeOptions, _Run
 from sitl.stub.protocol import Channel
 from tests.bench.wire import MEAN_ABS_MAX_M, RTK, WORST_MAX_M, example
+from tests.unguarded import unguarded
 from tests.virtual_time import START_S, WIRE_S, Delivery, JumpingLoop, WireLink
 
 _TICK_S = 0.02
@@ -89,7 +90,7 @@ async def _fly(
     loop = asyncio.get_running_loop()
     config = load(config_file)
     link = WireLink(config.link.url, component_options(config), clock=loop.time)
-    executor = build_executor(config, link)
+    executor = unguarded(build_executor(config, link))
     if wired is not None:
         wired(link, executor)
     vehicle = asyncio.create_task(_vehicle(stub, link, held_s))

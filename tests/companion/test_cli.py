@@ -30,6 +30,7 @@ from companion.output.servo import ServoExecutor
 from companion.output.timed import DryRunExecutor
 from tests.companion.wire_peer import free_port, heard
 from tests.json_answers import CONFIG, MAP, Captured, run_json
+from tests.unguarded import unguarded
 
 # ------------------------------------------------------------------------------- the program itself
 
@@ -391,7 +392,7 @@ def test_outputs_are_those_of_the_configuration() -> None:
     overrides = ["output.closed_us=1100", "output.full_us=1900", "valve[0].channel=21"]
     config = load(Path(CONFIG), overrides=overrides)
     link = Link(config.link.url, component_options(config))
-    executor = build_executor(config, link)
+    executor = unguarded(build_executor(config, link))
     assert isinstance(executor, ServoExecutor)
 
     async def open_all() -> None:

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from companion.journal.journal import open_for_flight
+from companion.output.child import Child
 from companion.output.engine.lines import FileLines, SpiDevice
-from companion.output.gpio import EngineChild
 from sitl.stub.protocol import Channel
 from sitl.stub.server import open_link
 
@@ -40,7 +40,7 @@ def test_a_journal_that_cannot_be_opened_is_not_left_open(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     "start",
     [
-        lambda: EngineChild(["/nowhere/engine"]),
+        lambda: Child(["/nowhere/engine"]),
         lambda: FileLines("/dev/full", levels=0),
         lambda: SpiDevice("/dev/null", 1_000_000),
     ],

@@ -17,8 +17,9 @@ from analysis.fleet.adding import ALONE, _no_module_of_this_folder, add
 from analysis.fleet.store import Store
 from companion.cli.folders_own import _in_root
 from companion.core.types import PwmLimits
+from companion.output.child import Child
 from companion.output.engine.wire import PACKET_MAX, EngineSetup, Kind, Wiring, pack, unpack
-from companion.output.gpio import COMMAND, EngineChild
+from companion.output.gpio import COMMAND
 from sitl.workers import do_all
 from tests.companion.test_service_unit import UNIT
 
@@ -98,7 +99,7 @@ def test_a_picture_is_the_same_whatever_the_folder_says(hostile: Path, tmp_path:
 def test_the_valve_engine_runs_nothing_of_it(hostile: Path) -> None:
     pwm = PwmLimits(frequency_hz=11, duty_min=0.2, duty_max=0.9, min_on_s=0, min_off_s=0)
     wiring = Wiring(valves=(17, 18), return_line=22, return_normally_open=False)
-    child = EngineChild(COMMAND)
+    child = Child(COMMAND)
     try:
         setup = EngineSetup(wiring=wiring, pwm=pwm, device="no-such-chip")
         child.send(pack(Kind.SETUP, setup.as_bytes()))

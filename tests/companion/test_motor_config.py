@@ -21,6 +21,7 @@ from companion.config.rules import without_effect
 from companion.errors import ConfigError
 from companion.link.vehicle_link import VehicleLink
 from companion.output.composite import CompositeExecutor
+from companion.output.guarded import GuardedServoExecutor
 from companion.output.hardware_pwm import HardwarePwmExecutor
 from companion.output.servo import ServoExecutor
 from companion.output.timed import DryRunExecutor
@@ -258,7 +259,7 @@ def test_a_local_pump_is_a_part_of_its_own_and_is_stopped_after_the_service(tmp_
     executor = build_outputs(made, link(made))
     assert isinstance(executor, CompositeExecutor)
     kinds = [type(part) for part in parts_of(executor)]
-    assert kinds == [HardwarePwmExecutor, ServoExecutor]
+    assert kinds == [HardwarePwmExecutor, GuardedServoExecutor]
     assert motor_closer_arguments(made) == ["--pwm", "0:1:1000"]
     text = build_unit(made, is_user=False, account="pi", is_realtime=False).text()
     assert "closer --pwm 0:1:1000" in text

@@ -257,6 +257,11 @@ class WirePeer:
         return bool(self.open_channels)
 
     @property
+    def is_ready(self) -> bool:
+        """Whether all is closed and the companion decides: before that its guardian closes."""
+        return self.is_all_closed and bool(self.of("NAMED_VALUE_FLOAT"))
+
+    @property
     def is_all_closed(self) -> bool:
         return len(self.outputs) == 6 and not self.is_spraying
 

@@ -18,9 +18,10 @@ from itertools import pairwise
 import pytest
 
 from companion.core.types import PwmLimits, SprayPlan, TimedChange
+from companion.output.child import Child
 from companion.output.engine.lines import GpiodLines, load_gpiod
 from companion.output.engine.wire import PACKET_MAX, EngineSetup, Kind, Wiring, pack, unpack
-from companion.output.gpio import COMMAND, EngineChild, GpioExecutor
+from companion.output.gpio import COMMAND, GpioExecutor
 from tests.gpio.sim import SimChip
 
 pytestmark = pytest.mark.needs_gpiosim
@@ -181,7 +182,7 @@ async def test_an_engine_that_ends_or_stands_still_leaves_closed_lines(
 def test_a_killed_engine_gives_its_lines_back_to_their_pull(chip: SimChip) -> None:
     chip.pull(3, up=True)
     # An engine with nobody to take its lines over: what the kernel alone does.
-    child = EngineChild(COMMAND)
+    child = Child(COMMAND)
     child.send(pack(Kind.SETUP, setup(chip.label, normally_open=True).as_bytes()))
     child.socket.settimeout(PATIENCE_S)
     assert unpack(child.socket.recv(PACKET_MAX))[0] is Kind.READY

@@ -151,13 +151,14 @@ def test_command_line_imports_other_packages_only_when_they_are_called() -> None
 def test_run_loads_what_every_flight_needs_and_no_more() -> None:
     _, _, files = house.loaded(ROOT, tries=1)
     assert len(files) <= 100
-    assert sum(map(house.code_lines, files)) <= 17_000
+    # 17,000 until Part 17, whose rules of motion, floods and stamps are in every flight.
+    assert sum(map(house.code_lines, files)) <= 17_500
     # Each of these is loaded by the configuration that switches it on.
     optional = {
         "companion/config": {"legal_entries", "limits", "motor_rules", "wiring_rules", "wording"},
         "companion/cli": {"drawing", "folders_own", "sensor_parts", "systemd", "web_parts"},
         "companion/link": {"mission_reader", "serial_port", "signing"},
-        "companion/output": {"composite", "gpio", "hardware_pwm", "pwm", "servo"},
+        "companion/output": {"composite", "gpio", "guarded", "hardware_pwm", "pwm", "servo"},
     }
     of_options = {f"{folder}/{name}.py" for folder, names in optional.items() for name in names}
     assert all((ROOT / name).is_file() for name in of_options)

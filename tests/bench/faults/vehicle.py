@@ -50,6 +50,7 @@ class Vehicle(StubServer):
         self.wire = Wire()
         self.pulses: list[Pulse] = []
         self.texts: list[str] = []
+        self.is_decided_for = False  # until then the companion's guardian closes
         autopilot.hears = self._hear
         self._link = link
         self._terminal: Terminal | None = None
@@ -123,7 +124,8 @@ class Vehicle(StubServer):
     @property
     def is_known(self) -> bool:
         """Return whether the companion has been told all that it decides by."""
-        return {HEARTBEAT, POSITION, LANDED, *_ASKED_FOR} <= self.wire.kinds
+        known = {HEARTBEAT, POSITION, LANDED, *_ASKED_FOR} <= self.wire.kinds
+        return known and self.is_decided_for
 
     # ------------------------------------------------------------------------------ flight
 
@@ -161,6 +163,7 @@ class Vehicle(StubServer):
     def _hear(self, message: Message, _now_s: float) -> None:
         if message.get_type() == "STATUSTEXT":
             self.texts.append(str(message.text))
+        self.is_decided_for |= message.get_type() == "NAMED_VALUE_FLOAT"
 
     # ----------------------------------------------------------------------------- outputs
 

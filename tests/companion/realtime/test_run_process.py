@@ -74,7 +74,7 @@ async def test_a_signal_closes_every_valve_and_ends_the_process(
     port = free_port()
     peer = peer_over_the_middle()
     async with companion(config, port) as process, over_udp(peer, port):
-        await peer.until(lambda: peer.is_all_closed, within_s=20.0)
+        await peer.until(lambda: peer.is_ready, within_s=20.0)
         peer.place(east_m=-6.0)
         peer.enable()
         await peer.until(lambda: len(peer.open_channels) == 6)
@@ -90,7 +90,7 @@ async def test_no_extreme_of_any_message_ends_the_process(config: Path) -> None:
     port = free_port()
     peer = peer_over_the_middle()
     async with companion(config, port) as process, over_udp(peer, port):
-        await peer.until(lambda: peer.is_all_closed, within_s=20.0)
+        await peer.until(lambda: peer.is_ready, within_s=20.0)
         peer.place(east_m=-6.0)
         peer.enable()
         await peer.until(lambda: len(peer.open_channels) == 6)
