@@ -35,6 +35,7 @@ from companion.core.types import (
     Fix,
     GnssReport,
     HeartbeatReport,
+    Inhibit,
     LandedReport,
     Method,
     OperatorCommand,
@@ -113,7 +114,9 @@ def prepare(options: AlongOptions) -> Bed:
     flight = read_flight(options.log, setup.limits.allows)
     states = flight.states
     if setup.pumping is not None or setup.atomisers:
-        raise ConfigError(f"{config.path}: --along judges PWM valves, and here is a pump or more")
+        raise ConfigError(
+            f"{config.path}: --along needs PWM valves; it cannot judge pumps or atomisers"
+        )
     rate_hz = options.position_rate_hz
     if rate_hz is None:
         rate_hz = float(config.link.position_rate_hz)
@@ -131,13 +134,13 @@ def prepare(options: AlongOptions) -> Bed:
         path, told = paths_of(flight, earth)
         setup = replace(setup, prescription=zones_along(path, setup, seed=options.seed))
         notes.append(
-            f"no map under this flight: {setup.prescription.zone_count} zones of {ZONE_MIN_M:g} to "
-            f"{ZONE_MAX_M:g} m were laid across it"
+            f"no map under this flight: laid {setup.prescription.zone_count} zones of "
+            f"{ZONE_MIN_M:g} to {ZONE_MAX_M:g} m across the track"
         )
     off_m2 = (told.east_m - path.east_m) ** 2 + (told.north_m - path.north_m) ** 2
     notes.append(
-        f"told and smoothed places are {math.sqrt(float(off_m2.mean())):.2f} m apart (rms): "
-        "claim nothing finer"
+        f"reported and smoothed positions differ by {math.sqrt(float(off_m2.mean())):.2f} m (rms); "
+        "smaller differences in the table mean nothing"
     )
     limits, eased = _eased(setup.limits, flight)
     lag = replace(setup.lag, position_s=POSITION_S)
@@ -166,8 +169,8 @@ def _told(
         ticks = np.floor((states.time_s - states.time_s[0]) * rate_hz + 0.25)
         return states[np.diff(ticks, prepend=-1.0) > 0.0]
     notes.append(
-        f"the log holds {flight.rate_hz:.0f} states a second: those between are made of the one "
-        "before and the one after, which nobody knows in flight"
+        f"the log holds {flight.rate_hz:.0f} positions a second; those between were interpolated "
+        "from both sides, which no companion can do in flight"
     )
     at_s = _between(states.time_s, rate_hz)
     at = told.at(at_s)
@@ -252,7 +255,7 @@ def _eased(limits: Limits, flight: Recorded) -> tuple[Limits, list[str]]:
     barred = {
         ", ".join(sorted(others)): bool(others),
         f"{speed_m_s:.1f} m/s": speed_m_s > limits.speed_max_m_s,
-        f"{low_m:.0f} to {high_m:.0f} m of height": (
+        f"{low_m:.0f} to {high_m:.0f} m high": (
             low_m < limits.height_min_m or high_m > limits.height_max_m
         ),
         f"fix {fix.name}": fix < limits.fix,
@@ -268,7 +271,9 @@ def _eased(limits: Limits, flight: Recorded) -> tuple[Limits, list[str]]:
         enable_by=frozenset({"command"}), rc_channel=None, estop_required=False,
     )  # fmt: skip
     said = "; ".join(what for what, is_barred in barred.items() if is_barred)
-    return eased, [f"sprayed here though [safety] bars it: {said}"] * bool(said)
+    return eased, [f"[safety] would have kept the valves closed ({said}); ignored here"] * bool(
+        said
+    )
 
 
 def _modes(flight: Recorded) -> set[str]:
@@ -492,7 +497,7 @@ def fly_along(options: AlongOptions, say: Callable[[str], None]) -> dict[str, An
         ]
         rows.append(_row(method, [figures_of(*each) for each in zip(beds, flights, strict=True)]))
         records[method] = flights[0].record
-        say(f"{method}: flown {len(flights)} times")
+        say(f"{method}: {len(flights)} flights")
     bed = beds[0]
     result = {
         "log": bed.flight.name,
@@ -549,19 +554,19 @@ def _limits(rows: list[dict[str, Any]]) -> str:
         "misapplied_percent", "turn_misapplied_percent", "straight_misapplied_percent",
         "cannot_percent",
     )]  # fmt: skip
-    (ours, best), (turn, _), (straight, _), (cannot, _) = found
+    (_, best), (turn, _), (straight, _), (cannot, _) = found
     return (
-        f"of {ours} % misapplied {best} % are the sprayer's own, the rest comes of not knowing the "
-        f"flight; in turns {turn} %, elsewhere {straight} %; {cannot} % of the volume is asked for "
-        "where the vehicle is too slow or too fast for the sprayer, and not judged"
+        f"{best} % is the sprayer's own error, which perfect knowledge of the flight leaves too; "
+        f"in turns vrspray misapplied {turn} %, elsewhere {straight} %; {cannot} % of the volume "
+        "is not counted, because the vehicle flew too slowly or too fast for the sprayer there"
     )
 
 
 def along_lines(result: dict[str, Any]) -> Iterator[str]:
     """Yield the results for a person."""
     yield (
-        f"{result['log']}: {result['flown_s']:.0f} s, {result['speed_m_s']:.1f} m/s (median), told "
-        f"at {result['position_rate_hz']:g} Hz; {result['flights']} flights a method"
+        f"{result['log']}: {result['flown_s']:.0f} s at {result['speed_m_s']:.1f} m/s (median), "
+        f"positions at {result['position_rate_hz']:g} Hz, {result['flights']} flights per method"
     )
     yield (
         f"{'':<10}{'misapplied %':>14}{'in turns':>10}{'lag m':>8}{'median':>8}{'step m':>8}"
@@ -576,7 +581,8 @@ def along_lines(result: dict[str, Any]) -> Iterator[str]:
             f"{_number(row['volume_error_percent']):>10}{missed:>12}"
         )
     yield f"limits: {result['limits']}"
-    yield f"shut at times, by: {', '.join(result['methods'][0]['inhibits'])}"
+    reasons = result["methods"][0]["inhibits"]
+    yield f"valves closed at times: {', '.join(Inhibit(each).words for each in reasons)}"
     for text in result["notes"]:
         yield f"note: {text}"
 

@@ -120,7 +120,7 @@ def read_flight(path: Path, allows: Callable[[str], bool] = bool) -> Recorded:
     """
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
-        raise ConfigError(f"{path}: give a log as {', '.join(_READERS)}")
+        raise ConfigError(f"{path}: not a log of a flight; give one of {', '.join(_READERS)}")
     try:
         flight = reader(path)
         return _longest(flight, allows) or _longest(flight, bool) or _refuse(path)
@@ -130,12 +130,13 @@ def read_flight(path: Path, allows: Callable[[str], bool] = bool) -> Recorded:
         # Readers raise whatever they like, and lines of it.
         why = " ".join((getattr(error, "strerror", None) or repr(error)).split())
         raise ConfigError(
-            f"{path}: no {path.suffix} of a flight ({why}); it takes place, speed and heading"
+            f"{path}: not a {path.suffix} log of a flight ({why}); it must hold position, velocity "
+            "and heading"
         ) from error
 
 
 def _refuse(path: Path) -> NoReturn:
-    raise ConfigError(f"{path}: no flight: armed, nothing moves in it for {LEAST_S:g} s")
+    raise ConfigError(f"{path}: no flight in it: nothing armed moves for {LEAST_S:g} s")
 
 
 def _longest(flight: Recorded, allows: Callable[[str], bool]) -> Recorded | None:
@@ -162,9 +163,11 @@ def _longest(flight: Recorded, allows: Callable[[str], bool]) -> Recorded | None
     notes, gaps_s = [], np.diff(rows.time_s)
     missing = int((gaps_s > 1.5 * np.median(gaps_s)).sum())
     if len(found) > 1:
-        notes.append(f"{len(found)} stretches of flight in the log: the longest is flown")
+        notes.append(f"the log holds {len(found)} flights; the longest one is used")
     if missing:
-        notes.append(f"{missing} gaps between states, of up to {gaps_s.max():.2f} s: as they are")
+        notes.append(
+            f"{missing} gaps between positions, up to {gaps_s.max():.2f} s, kept as they are"
+        )
     return replace(flight, states=rows, notes=tuple(notes))
 
 
@@ -297,7 +300,7 @@ def _ulog(path: Path) -> Recorded:
     try:
         from pyulog import ULog
     except ImportError:
-        raise ConfigError(f"{path}: pyulog reads it; {install_command('office')}") from None
+        raise ConfigError(f"{path}: reading it needs pyulog; {install_command('office')}") from None
     topics = ["vehicle_local_position", "vehicle_status", "vehicle_gps_position"]
     with path.open("rb") as file:
         found = ULog(file, topics).data_list

@@ -68,9 +68,9 @@ def test_a_log_that_pauses_is_two_flights_and_the_longer_one_is_flown(tmp_path: 
     path = flown_logs.telemetry(tmp_path / "a.tlog", skip_s=(106.0, 109.0))
     flight = read_flight(path)
     assert flight.states.time_s[0] >= 109.0
-    assert flight.notes == ("2 stretches of flight in the log: the longest is flown",)
+    assert flight.notes == ("the log holds 2 flights; the longest one is used",)
     short = read_flight(flown_logs.telemetry(tmp_path / "b.tlog", skip_s=(108.0, 108.5)))
-    assert short.notes == ("1 gaps between states, of up to 0.60 s: as they are",)
+    assert short.notes == ("1 gaps between positions, up to 0.60 s, kept as they are",)
 
 
 def test_an_autopilot_that_begins_anew_has_flown_twice(log: Path, tmp_path: Path) -> None:
@@ -78,7 +78,7 @@ def test_an_autopilot_that_begins_anew_has_flown_twice(log: Path, tmp_path: Path
     twice.write_bytes(log.read_bytes() * 2)
     flight = read_flight(twice)
     assert flight.states.time_s == pytest.approx(read_flight(log).states.time_s, abs=1e-6)
-    assert any("2 stretches" in note for note in flight.notes)
+    assert any("2 flights" in note for note in flight.notes)
 
 
 @pytest.mark.parametrize(
@@ -86,10 +86,10 @@ def test_an_autopilot_that_begins_anew_has_flown_twice(log: Path, tmp_path: Path
     [
         ("a.tlog", b"", "no flight"),
         ("a.tlog", b"\0" * 5000, "no flight"),
-        ("a.bin", b"", "no .bin of a flight"),
-        ("a.bin", b"\xa3\x95\x80" + b"x" * 5000, "no"),
-        ("a.csv", b"1,2", "give a log as .bin, .tlog, .ulg"),
-        ("a.ulg", b"ULog", "no .ulg of a flight"),
+        ("a.bin", b"", "not a .bin log"),
+        ("a.bin", b"\xa3\x95\x80" + b"x" * 5000, "not a .bin log"),
+        ("a.csv", b"1,2", "give one of .bin, .tlog, .ulg"),
+        ("a.ulg", b"ULog", "not a .ulg log"),
         ("missing.tlog", None, "No such file"),
     ],
 )
@@ -112,7 +112,7 @@ def test_without_pyulog_a_line_says_how_to_get_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyulog", None)
-    with pytest.raises(ConfigError, match=r"pyulog reads it; .*vrspray\[office\]"):
+    with pytest.raises(ConfigError, match=r"reading it needs pyulog; .*vrspray\[office\]"):
         read_flight(flown_logs.ulog(tmp_path / "a.ulg"))
 
 
@@ -142,13 +142,13 @@ def test_rates_leave_states_out_or_put_some_between_and_none_into_a_gap(
     half = prepare(AlongOptions(log=log, position_rate_hz=5.0))
     assert np.isin(half.told.time_s, every.time_s).all()
     assert len(half.told) == pytest.approx(len(every) / 2, abs=1)
-    assert not any("knows in flight" in note for note in half.notes)
+    assert not any("interpolated" in note for note in half.notes)
     path = flown_logs.telemetry(tmp_path / "gap.tlog", skip_s=(108.0, 108.6))
     double = prepare(AlongOptions(log=path, position_rate_hz=20.0))
     steps_s = np.diff(double.told.time_s)
     assert float(np.median(steps_s)) == pytest.approx(0.05, abs=0.001)
     assert (steps_s > 0.51).sum() == 1
-    assert any("nobody knows in flight" in note for note in double.notes)
+    assert any("interpolated" in note for note in double.notes)
 
 
 # ------------------------------------------------------------------------------------- closed loop
@@ -175,13 +175,13 @@ def test_a_flight_is_judged_beside_its_references(log: Path, tmp_path: Path) -> 
     assert (tmp_path / "out" / "along.png").stat().st_size > 20_000
     lines = list(along_lines(result))
     assert lines[5].startswith("look-ahead")
-    assert any(line.startswith("limits: of ") for line in lines)
+    assert any(line.startswith("limits: ") for line in lines)
 
 
 def test_a_flight_by_hand_is_sprayed_and_said_to_be_barred(tmp_path: Path) -> None:
     path = flown_logs.telemetry(tmp_path / "hand.tlog", mode=flown_logs.LOITER)
     bed = piece(prepare(AlongOptions(log=path, position_rate_hz=10.0)), 100.0, 109.0)
-    assert bed.notes[-1] == "sprayed here though [safety] bars it: LOITER"
+    assert bed.notes[-1] == "[safety] would have kept the valves closed (LOITER); ignored here"
     assert fly_method(bed, "vrspray", 1).record.volume_ml[-1].sum() > 100.0
 
 
@@ -240,7 +240,7 @@ def test_the_stub_follows_a_flight_with_its_states_and_modes(log: Path) -> None:
 @needs_logs
 def test_the_smoothed_path_stays_by_what_was_told() -> None:
     bed = prepare(AlongOptions(log=LOGS / "q130.BIN"))
-    assert any("0.02 m apart" in note for note in bed.notes)
+    assert any("differ by 0.02 m" in note for note in bed.notes)
     path, states = bed.path.at(bed.flight.states.time_s), bed.flight.states
     off_m_s = np.hypot(
         path.velocity_east_m_s - states.east_m_s, path.velocity_north_m_s - states.north_m_s
