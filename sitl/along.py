@@ -53,7 +53,16 @@ from sitl.fly_files import draw
 from sitl.knowledge import perfect_setup
 from sitl.outputs import SERVO_FRAME_S, WIRE_S
 from sitl.profile import MeasuredSet, PlantProfile, Pulsing, load_profile
-from sitl.recorded import COLUMNS, MOVING_M_S, Recorded, held, paths_of, read_flight, rows_of
+from sitl.recorded import (
+    COLUMNS,
+    MOVING_M_S,
+    Recorded,
+    held,
+    paths_of,
+    read_flight,
+    receiver_behind,
+    rows_of,
+)
 
 if TYPE_CHECKING:
     from analysis.strips import Strip
@@ -75,6 +84,8 @@ FINE_S, PLAN_S, LEASE_S = 0.002, 0.05, 0.3
 # So long before and after a boundary a change is judged, and from so near on its levels.
 AROUND_S, LEVEL_FROM_S, MISSED_BELOW, MOVED_M = 0.5, 0.2, 0.5, 0.1
 RATE_MIN_HZ, RATE_MAX_HZ = 4.0, 50.0
+# A receiver is rarely later than this, and an estimate farther from it is at fault.
+BEHIND_MAX_S, OFF_MAX_M = 0.25, 0.5
 
 METHODS = ("vrspray", "perfect", "none", "look-ahead")
 
@@ -152,7 +163,20 @@ def prepare(options: AlongOptions) -> Bed:
         profile=_plant(options.plant, setup),
         output="gpio" if config.output.kind == "gpio" else "servo",
         rate_hz=rate_hz,
-        notes=(*notes, *eased),
+        notes=(*notes, *_receiver(receiver_behind(flight, path, earth)), *eased),
+    )
+
+
+def _receiver(behind: tuple[float, float] | None) -> Iterator[str]:
+    """Yield where the receiver's own positions lie against the autopilot's."""
+    if behind is None:
+        return
+    late_s, off_m = behind
+    is_usual = 0.0 <= late_s <= BEHIND_MAX_S and off_m <= OFF_MAX_M
+    yield (
+        f"the receiver's positions lie {1000.0 * late_s:.0f} ms behind the autopilot's estimate "
+        f"and {off_m:.2f} m beside it{'' if is_usual else ', which is UNUSUAL'}: the delay that "
+        "the autopilot assumes, not a measured one"
     )
 
 

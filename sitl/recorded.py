@@ -89,6 +89,24 @@ def paths_of(flight: Recorded, earth: Earth) -> tuple[Trajectory, Trajectory]:
     )
 
 
+def receiver_behind(flight: Recorded, path: Trajectory, earth: Earth) -> tuple[float, float] | None:
+    """Return how late [s] and how far off [m] the receiver's own positions are on the path.
+
+    It is the delay that the autopilot assumes, which need not be the true one. None: too few.
+    """
+    time_s, *place = flight.receiver[:, flight.receiver[1:].any(axis=0)]
+    at = path.at(time_s)
+    known = (at.speed_m_s > MOVING_M_S) & (time_s > path.time_s[0]) & (time_s < path.time_s[-1])
+    if known.sum() < LEAST_S:
+        return None
+    east_m, north_m = earth.to_local_all(*place)
+    late = np.concatenate((at.velocity_east_m_s[known], at.velocity_north_m_s[known]))
+    beside = np.kron(np.eye(2), np.ones((known.sum(), 1)))
+    off_m = np.concatenate(((at.east_m - east_m)[known], (at.north_m - north_m)[known]))
+    behind_s, *apart_m = np.linalg.lstsq(np.column_stack((late, beside)), off_m, rcond=None)[0]
+    return float(behind_s), float(np.hypot(*apart_m))
+
+
 def held(told: Held, now_s: float, default: Any) -> Any:
     """Return what holds at a time, of what was told in order of time.
 
@@ -261,7 +279,6 @@ def _telemetry(path: Path) -> Recorded:
                 continue
             autopilot, now_s = who, max(at_s, now_s)
             told[kind].append((now_s, message))
-    fixes = told["GPS_RAW_INT"]
     rows = [
         (
             at_s, m.lat * 1e-7, m.lon * 1e-7, m.relative_alt * 1e-3, m.vx * 0.01, m.vy * 0.01,
@@ -274,8 +291,8 @@ def _telemetry(path: Path) -> Recorded:
         states=table_of(np.array(rows).reshape(-1, len(COLUMNS)).T),
         modes=[(at_s, _copter(m.custom_mode)) for at_s, m in told["HEARTBEAT"]],
         armed=[(at_s, bool(m.base_mode & 128)) for at_s, m in told["HEARTBEAT"]],
-        fixes=[(at_s, m.fix_type) for at_s, m in fixes],
-        receiver=np.array([(at_s, m.lat * 1e-7, m.lon * 1e-7) for at_s, m in fixes]).T,
+        fixes=[(at_s, m.fix_type) for at_s, m in told["GPS_RAW_INT"]],
+        receiver=np.empty((3, 0)),  # these come when the link has room, with no stamp to go by
     )
 
 

@@ -23,7 +23,7 @@ from sitl.along import (
 )
 from sitl.earth import Earth
 from sitl.follow import Told, along
-from sitl.recorded import read_flight
+from sitl.recorded import paths_of, read_flight, receiver_behind
 from sitl.serve import Following, Step
 from sitl.stub.protocol import dialect
 from tests import flown_logs
@@ -149,6 +149,29 @@ def test_rates_leave_states_out_or_put_some_between_and_none_into_a_gap(
     assert float(np.median(steps_s)) == pytest.approx(0.05, abs=0.001)
     assert (steps_s > 0.51).sum() == 1
     assert any("interpolated" in note for note in double.notes)
+
+
+def test_how_late_and_how_far_off_a_receiver_is_against_the_estimate(log: Path) -> None:
+    flight = read_flight(log)
+    path, _ = paths_of(flight, flown_logs.HOME)
+    at_s = np.arange(path.time_s[0], path.time_s[-1], 0.2)
+    late = path.at(at_s - 0.08)
+    place = flown_logs.HOME.to_geographic_all(late.east_m + 0.3, late.north_m - 0.4)
+    heard = replace(flight, receiver=np.array([at_s, *place]))
+    found = receiver_behind(heard, path, flown_logs.HOME)
+    assert found is not None
+    assert found[0] == pytest.approx(0.08, abs=0.004)
+    assert found[1] == pytest.approx(0.5, abs=0.02)
+    # Telemetry has no stamps of the receiver's own.
+    assert receiver_behind(flight, path, flown_logs.HOME) is None
+
+
+@needs_logs
+@pytest.mark.parametrize(("name", "late_ms"), [("q116", 88), ("q130", 58), ("q083", 102)])
+def test_receivers_of_real_flights_are_behind_their_estimates(name: str, late_ms: int) -> None:
+    notes = " ".join(prepare(AlongOptions(log=LOGS / f"{name}.BIN")).notes)
+    assert f"lie {late_ms} ms behind" in notes
+    assert "UNUSUAL" not in notes
 
 
 # ------------------------------------------------------------------------------------- closed loop
