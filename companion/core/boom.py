@@ -120,8 +120,10 @@ def width_across_course_m(width_m: float, *, heading_deg: float, course_deg: flo
 # order looks ahead at most, a valve 2.5 m from the middle gains or loses up to 0.04 m.
 STRAIGHT_YAW_RATE_DEG_S = 3.0
 STRAIGHT_LATERAL_M_S2 = 1.0
-# From here on each valve is dosed by a speed of its own.
+# Beyond these each valve is dosed by the speed at which it sweeps the ground then, and not by what
+# the boom's middle does now. At 5 m/s 0.3 m/s2 turn the course by 1 degree in 0.3 s.
 STEADY_YAW_RATE_DEG_S = 1.0
+STEADY_LATERAL_M_S2 = 0.3
 # Knots of a path nearer than this are one.
 KNOTS_APART_S = 1e-3
 # In a turn a chord is so long, or this share of how far ahead it begins; leads nearer than
@@ -390,28 +392,47 @@ def turning_of(state: VehicleState) -> Turning:
     return Turning(state.yaw_rate_deg_s, state.yaw_gain_deg_s2)
 
 
-def speed_shares(state: VehicleState, boom: Boom, dt_s: float) -> list[float]:
-    """Return how fast each valve goes `dt_s` from now, beside the position reference.
+class Sweep(NamedTuple):
+    """How the boom moves along the nose at some moment, and how the nose turns.
 
-    0 for one that the turn carries back over ground that it has just left: the boom pivots, and
-    nothing that falls then falls on a pass.
+    A strip that moves along itself treats no new ground, so only its velocity along the nose counts
+    for the dose. `speed_m_s` is how fast the reference goes in whatever direction.
     """
-    now = turning_of(state)
-    # What fades is never faster later on; mostly the nose stands.
-    if not now.fastest_deg_s > STEADY_YAW_RATE_DEG_S:
-        return [1.0] * len(boom.valves)
-    turned_deg, yaw = now.after(dt_s)
-    if not yaw.fastest_deg_s > STEADY_YAW_RATE_DEG_S:
-        return [1.0] * len(boom.valves)
-    ae, an = state.acceleration_east_m_s2, state.acceleration_north_m_s2
-    east, north, _, _ = _carried(state, dt_s, ae, an)
+
+    along_m_s: float
+    yaw_rad_s: float
+    speed_m_s: float
+
+    def of(self, boom: Boom) -> list[float]:
+        """Return how fast the strip of each valve sweeps the ground [m/s].
+
+        Where some go forwards and others back, the boom pivots: what goes back goes over ground
+        that it has just left, and sweeps none. All go back where a copter flies tail first.
+        """
+        swept = [self.along_m_s - self.yaw_rad_s * right_m for right_m, _, _ in boom.strips_m]
+        if max(swept) < 0.0:
+            return [-each for each in swept]
+        return [each if each > 0.0 else 0.0 for each in swept]
+
+
+def sweep_at(state: VehicleState, dt_s: float) -> Sweep:
+    """Return how the boom sweeps the ground `dt_s` from now."""
+    turned_deg, rate_deg_s = _turned(state, dt_s)
+    east, north, _, _ = _carried(
+        state, dt_s, state.acceleration_east_m_s2, state.acceleration_north_m_s2
+    )
     angle = math.radians((state.heading_deg or 0.0) + turned_deg)
-    sin, cos, rate = math.sin(angle), math.cos(angle), math.radians(yaw.rate_deg_s)
-    own_east = east + rate * (boom.forward_m * cos - boom.right_m * sin)
-    own_north = north - rate * (boom.right_m * cos + boom.forward_m * sin)
-    pace = np.hypot(own_east, own_north) / max(math.hypot(east, north), 1e-3)
-    found: list[float] = np.where(own_east * east + own_north * north > 0.0, pace, 0.0).tolist()
-    return found
+    along = east * math.sin(angle) + north * math.cos(angle)
+    return Sweep(along, math.radians(rate_deg_s), math.hypot(east, north))
+
+
+def sweeps_alike(state: VehicleState) -> bool:
+    """Return whether all valves sweep the ground as fast as the reference, now and soon."""
+    if turning_of(state).fastest_deg_s > STEADY_YAW_RATE_DEG_S:
+        return False
+    ve, vn = state.velocity_east_m_s, state.velocity_north_m_s
+    across = ve * state.acceleration_north_m_s2 - vn * state.acceleration_east_m_s2
+    return abs(across) <= STEADY_LATERAL_M_S2 * math.hypot(ve, vn)
 
 
 def place_velocity(state: VehicleState) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from functools import partial
 from operator import attrgetter
 from typing import TYPE_CHECKING, NamedTuple
 
-from companion.core.boom import Intervals, Paths, speed_shares
+from companion.core.boom import Intervals, Paths, sweep_at, sweeps_alike
 from companion.core.crossings import (
     NO_ROUTES,
     Crossing,
@@ -363,11 +363,11 @@ def _orders(
     )  # fmt: skip
     # What the meter's flow is of.
     trim = _trim(setup, state, before, liquid_of(setup.pumping, plan), now_s)
-    skew = skew_of(state, speed_m_s)
+    skew, is_alike = skew_of(state, speed_m_s), sweeps_alike(state)
 
     def dose(number: int, share: float) -> Dosing:
         own = share if trim is None else share * trim.sets[number].trim
-        return dosing_of(setup, number, skew / own, state.rate_percent)
+        return dosing_of(setup, number, (skew if is_alike else 1.0) / own, state.rate_percent)
 
     dosing: Sequence[Dosing] = (on_off,) * len(in_force)
     is_early, own_routes = False, routes
@@ -378,7 +378,9 @@ def _orders(
         own_routes, is_early = sections(
             setup.pumping, routes, ran_s=watched.ran_s, was_early=before.is_early, now_s=now_s
         )
-    own_routes, shares = _in_turn(setup, state, own_routes, in_force, now_s)
+    shares = [1.0] * len(in_force)
+    if not is_alike:
+        own_routes, shares = _in_turn(setup, state, own_routes, in_force, now_s)
     each = zip(own_routes, shares, in_force, dosing, strict=True)
     valves = _scheduled(setup, state, list(each), index, speed_m_s, now_s)
     gain = 1.0 if trim is None else trim.sets[index].trim
@@ -440,22 +442,28 @@ def _in_turn(
     in_force: tuple[float, ...],
     now_s: float,
 ) -> tuple[tuple[Route, ...], list[float]]:
-    """Return the routes, and how fast each valve goes beside the boom when its orders act.
+    """Return the routes, and how fast each valve sweeps the ground beside the reference's speed.
 
-    A valve that the turn carries backwards closes. At the end of a pass, where the boom begins to
-    swing about one end, nothing opens once more.
+    Each by its own velocity along the nose: on the routes when it gets there, else when an order
+    of now acts. A valve that the turn carries backwards closes. At the end of a pass, where the
+    boom begins to swing about one end, nothing opens once more.
     """
-    shares = speed_shares(state, setup.boom, acts_after_s(setup))
-    # Mostly all of them go as the boom does.
-    if shares.count(1.0) == len(shares) or all(own > 0.0 for own in shares):
-        return routes, shares
-    swings = state.yaw_rate_deg_s * state.yaw_gain_deg_s2 > 0.0
+    soon = sweep_at(state, acts_after_s(setup))
+    swept_m_s = soon.of(setup.boom)
+    swings = min(swept_m_s) == 0.0 and state.yaw_rate_deg_s * state.yaw_gain_deg_s2 > 0.0
     closed: Route = (Crossing(now_s, None, False, 0.0),)
+
+    def swept(step: Crossing, valve: int) -> Crossing:
+        there_m_s = sweep_at(state, step.at_s - state.time_s).of(setup.boom)
+        return step._replace(speed_m_s=there_m_s[valve])
+
     held = [
-        closed if not own > 0.0 or (swings and duty == 0.0) else route
-        for route, own, duty in zip(routes, shares, in_force, strict=True)
+        closed
+        if not own > 0.0 or (swings and duty == 0.0)
+        else tuple([swept(step, valve) for step in route])
+        for valve, (route, own, duty) in enumerate(zip(routes, swept_m_s, in_force, strict=True))
     ]
-    return tuple(held), shares
+    return tuple(held), [own / max(soon.speed_m_s, 1e-3) for own in swept_m_s]
 
 
 def _trim(
@@ -561,8 +569,8 @@ def _decision(
     rates = [valve.rate_now_l_ha for valve in orders.valves]
     if setup.pumping is not None:  # of sections: what is prescribed for them, not open or shut
         rates = [rate_at(route, now_s) for route in routes]
-    # As if all valves of the set had the rate of this one.
-    flow_of = _flow_of(setup, state, orders.speed_m_s)
+    # As if all valves of the set had the rate of this one, across the boom.
+    flow_of = _flow_of(setup, state, orders.speed_m_s * orders.skew)
     known = {rate: flow_of(rate or 0.0) for rate in set(rates)}
     flows = [known[rates[valve]] for valve in nozzles.valves]
     too_much = {flow for flow in known.values() if not nozzles.curve.delivers(flow)}

@@ -11,10 +11,9 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from companion.core.boom import (
-    STEADY_YAW_RATE_DEG_S,
     STRAIGHT_LATERAL_M_S2,
     STRAIGHT_YAW_RATE_DEG_S,
-    speed_shares,
+    sweep_at,
     turning_of,
 )
 from companion.core.controller import Memory, step
@@ -187,23 +186,19 @@ def test_a_valve_is_dosed_by_the_speed_that_it_has_then(
     faded = YAW_FADE_S * (1.0 - np.exp(-times / YAW_FADE_S))
     turned_deg = float(np.sum(rate_deg_s + gain_deg_s2 * faded) * fine_s)
     then_deg_s = rate_deg_s + gain_deg_s2 * YAW_FADE_S * (1.0 - math.exp(-ahead_s / YAW_FADE_S))
-    last_deg_s = then_deg_s + gain_deg_s2 * YAW_FADE_S * math.exp(-ahead_s / YAW_FADE_S)
     nose = math.radians(heading_deg + turned_deg)
     spin = math.radians(then_deg_s)
-    shares = speed_shares(state, BOOM, ahead_s)
-    ahead = state.velocity_east_m_s, state.velocity_north_m_s
-    if max(abs(then_deg_s), abs(last_deg_s)) <= STEADY_YAW_RATE_DEG_S:
-        assert shares == [1.0] * 6
+    sweep = sweep_at(state, ahead_s)
+    east, north = state.velocity_east_m_s, state.velocity_north_m_s
+    along = east * math.sin(nose) + north * math.cos(nose)
+    if abs(along) < 0.1:  # forwards or backwards: that is the noise's
         return
-    for valve, share in zip(BOOM.valves, shares, strict=True):
-        # Clockwise from north: what is ahead goes to the right, what is right goes back.
-        east = valve.right_m * math.cos(nose) + valve.forward_m * math.sin(nose)
-        north = valve.forward_m * math.cos(nose) - valve.right_m * math.sin(nose)
-        own = ahead[0] + spin * north, ahead[1] - spin * east
-        forward = own[0] * ahead[0] + own[1] * ahead[1]
-        if abs(forward) > 0.1:  # 0 of one that goes back
-            wanted = math.hypot(*own) if forward > 0.0 else 0.0
-            assert share * speed_m_s == pytest.approx(wanted, abs=0.01)
+    for valve in BOOM.valves:
+        # Clockwise from north: a place to the right goes back, and so does the nose's own way.
+        swept = along - spin * valve.right_m
+        wanted = max(math.copysign(swept, swept * along), 0.0)
+        assert sweep.of(valve.right_m) == pytest.approx(wanted, abs=0.01)
+    assert sweep.speed_m_s == pytest.approx(speed_m_s)
 
 
 @pytest.mark.parametrize(("gain_deg_s2", "opens"), [(40.0, False), (-40.0, True)])
