@@ -65,6 +65,7 @@ from sitl.recorded import (
 )
 
 if TYPE_CHECKING:
+    from analysis.flight_record import FlightRecord
     from analysis.strips import Strip
     from companion.core.safety import Limits
     from companion.core.setup import Setup
@@ -267,6 +268,7 @@ def _plant(name: str | None, setup: Setup) -> PlantProfile:
         ),
         dead_open_s=opens_s,
         dead_close_s=max(lag.off_s - 0.5 * like.closing_s, opens_s),
+        flow_law="straight",
     )
 
 
@@ -451,12 +453,16 @@ def figures_of(bed: Bed, result: FlightResult) -> dict[str, Any]:
     yaw = np.abs(np.gradient(np.unwrap(record.heading_deg, period=360.0), record.step_s))
     wide = np.ones(2 * round(TURN_STAYS_S / record.step_s) + 1)
     turning = np.convolve(yaw > TURNING_DEG_S, wide, mode="same")
+    swept, fast = _swept_m_s(record), bed.setup.limits.speed_min_m_s
     table: list[Any] = []
     steps: list[Any] = []
-    for strip in strips:
+    for strip, own in zip(strips, swept[:-1], strict=True):
         track, parts = strip.track, misapplied_parts([strip])
         flow = rise_over(strip.asked_ml, track.period_steps) / track.period_s * 0.06
-        can = (flow >= least) & (flow <= full)
+        # Nor below the speed that its configuration asks for; and what a pivoting boom carries back
+        # goes over ground that it has just left.
+        goes_back = (own < 0.0) & (swept[:-1].max(axis=0) > 0.0)
+        can = (flow >= least) & (flow <= full) & (swept[-1] >= fast) & ~goes_back
         here = np.stack([np.interp(parts.time_s, track.time_s, each) for each in (can, turning)])
         table.append(np.stack((parts.wrong_ml, parts.asked_ml, *(here > 0.5))))
         steps += _steps(strip, can)
@@ -478,6 +484,15 @@ def figures_of(bed: Bed, result: FlightResult) -> dict[str, Any]:
         "steps": np.array(steps).reshape(-1, 3),
         "inhibits": result.inhibits,
     }
+
+
+def _swept_m_s(record: FlightRecord) -> Floats:
+    """Return how fast each strip goes along the nose, and last how fast the reference goes."""
+    step_s, nose = record.step_s, np.radians(np.unwrap(record.heading_deg, period=360.0))
+    east, north = np.gradient(record.east_m, step_s), np.gradient(record.north_m, step_s)
+    along = east * np.sin(nose) + north * np.cos(nose)
+    each = along - np.outer(record.boom.right_m, np.gradient(nose, step_s))
+    return np.vstack((each, np.hypot(east, north)))
 
 
 def _steps(strip: Strip, can: Any) -> Iterator[tuple[float, float, float]]:
@@ -582,7 +597,7 @@ def _limits(rows: list[dict[str, Any]]) -> str:
     return (
         f"{best} % is the sprayer's own error, which perfect knowledge of the flight leaves too; "
         f"in turns vrspray misapplied {turn} %, elsewhere {straight} %; {cannot} % of the volume "
-        "is not counted, because the vehicle flew too slowly or too fast for the sprayer there"
+        "is not counted: there the vehicle was too slow or too fast, or pivoted back over it"
     )
 
 

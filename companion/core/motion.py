@@ -45,14 +45,14 @@ VELOCITY_SD_M_S = 0.03
 # A place as an autopilot's estimator tells it goes on from message to message to within this:
 # rounded to 1e-7 degrees and 1 ms, 1 cm and 5 mm.
 SMOOTH_SD_M = 0.01
-# Its velocity likewise, to within the 1 cm/s that it is rounded to. Both filters follow it equally
+# Its velocity likewise, rounded to 1 cm/s. Both filters follow it equally
 # quickly and differ only in how long an acceleration lasts: of a slow and a quick one the quick one
 # was never believed, not even while a vehicle braked by 2 m/s2. Fitted on 2026-11-28 to logs of
 # flown ArduCopters and to flights beside both firmwares. What is foretold of the speed for 0.15 s
 # ahead errs by 0.037 m/s (rms; 0.064 with a slow and a quick one), beside ArduCopter by 0.015
 # (0.028), PX4 0.036 (0.040). 0.5 to 1.0 m/s2 in a second serve alike, but above 0.7 doubters are
 # too quick for positions at 5 Hz, and are no longer believed.
-SMOOTH_VELOCITY_SD_M_S = 0.01
+SMOOTH_VELOCITY_SD_M_S = 0.015
 SMOOTH_WANDER_M_S2_SQRT_S = 0.7
 # How far the told velocity is from that of the place where it is doubted, and for how long: PX4's,
 # in simulation, by 0.2 m/s (standard deviation). 0.1 to 0.3 m/s and 10 to 30 s serve alike.
