@@ -111,7 +111,7 @@ WINDOW_S = 1.0
 KEPT_S = 2.0 * WINDOW_S
 # A pulse that follows the last one sooner than half the shortest period is an echo of its edge.
 ECHO_SHARE = 0.5
-ECHOES_MAX = 0.05
+ECHOES_MAX, ECHOES_KEPT = 0.05, 4096
 # A meter that has lost or added pulses is not believed for this long after the last of them.
 FAULT_S = 1.0
 
@@ -160,7 +160,7 @@ class PulseCounter:
         self.lost_count = 0
         self.echo_count = 0
         self._edges: deque[tuple[float, int]] = deque()  # time, count with it
-        self._echoes: deque[float] = deque()
+        self._echoes: deque[float] = deque(maxlen=ECHOES_KEPT)
         self._number: int | None = None
         self._lost_s = -math.inf
         self._is_loss_told = True

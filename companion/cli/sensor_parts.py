@@ -185,6 +185,7 @@ def _tank(config: Config, meter: FlowMeter | None) -> TankSensor | None:
 # A second of pulses at 1 kHz; the kernel drops and numbers what does not fit.
 BUFFER_SIZE = 1024
 NANOSECONDS = 1e9
+_NO_WAIT = timedelta(0)
 
 
 class GpiodEdges:
@@ -224,14 +225,13 @@ class GpiodEdges:
             ) from error
 
     def read(self) -> Sequence[Edge]:
-        """Return the edges that the kernel has kept."""
-        edges: list[Edge] = []
-        while self._request is not None and self._request.wait_edge_events(timedelta(0)):
-            edges += [
-                Edge(event.timestamp_ns / NANOSECONDS, event.line_seqno)
-                for event in self._request.read_edge_events()
-            ]
-        return edges
+        """Return the edges that the kernel has kept, once: a wire that hums never ends."""
+        if self._request is None or not self._request.wait_edge_events(_NO_WAIT):
+            return []
+        return [
+            Edge(event.timestamp_ns / NANOSECONDS, event.line_seqno)
+            for event in self._request.read_edge_events()
+        ]
 
     def close(self) -> None:
         """Release the line."""
@@ -241,8 +241,6 @@ class GpiodEdges:
 
 
 # The level of one GPIO line by libgpiod 2, with its own pull-up.
-
-_NO_WAIT = timedelta(0)
 
 
 class GpiodLevel:
@@ -280,10 +278,10 @@ class GpiodLevel:
         """Return whether the level is high or has been since the last look; OSError if unknown."""
         if self._request is None:
             raise OSError("the line is not open")
-        has_risen = False
-        while self._request.wait_edge_events(_NO_WAIT):
-            events = self._request.read_edge_events()
-            has_risen = has_risen or any(event.event_type == self._rising for event in events)
+        # All that the kernel keeps comes at once; a contact that chatters never ends.
+        is_news = self._request.wait_edge_events(_NO_WAIT)
+        events = self._request.read_edge_events() if is_news else ()
+        has_risen = any(event.event_type == self._rising for event in events)
         return has_risen or bool(self._request.get_value(self._line) == self._high)
 
     def fileno(self) -> int | None:

@@ -24,7 +24,7 @@ from companion.cli.terminal import terminal
 from companion.core.types import SprayerState
 from companion.errors import LinkError
 from companion.link.census import AUTOPILOT_COMPONENT, mode_name
-from companion.link.codec import Framer
+from companion.link.framer import Framer, decoded
 
 # An error that was told is shown for so long; nobody tells that it is over.
 FAULT_S = 60.0
@@ -57,8 +57,9 @@ class Overheard:
 
     def take(self, data: bytes, now_s: float) -> None:
         """Take bytes in; what is no message is dropped."""
-        for message in self._framer.push(data, now_s):
-            self._take(message, message.get_type(), now_s)
+        for message in map(decoded, self._framer.push(data, now_s)):
+            if message is not None:
+                self._take(message, message.get_type(), now_s)
 
     def _take(self, message: Any, kind: str, now_s: float) -> None:
         sender = (message.get_srcSystem(), message.get_srcComponent())

@@ -38,6 +38,7 @@ from companion.core.types import (
 from companion.link.announcer import Announcer
 from companion.link.codec import Codec
 from companion.link.encode import Encoder
+from companion.link.intake import Source
 from companion.link.messages import (
     AckReceived,
     CommandReceived,
@@ -218,13 +219,13 @@ class Component:
         """Tell the operator of something that should be seen to."""
         self._announcer.note(text, is_warning=True)
 
-    def receive(self, data: bytes, received_s: float) -> list[Input]:
+    def receive(self, data: bytes, received_s: float, source: Source | None = None) -> list[Input]:
         """Return the inputs in `data`, and answer what wants an answer."""
         inputs: list[Input] = []
         if not self._has_begun:
             self._has_begun = True
             inputs += self._command_state.begin(received_s)
-        for message in self._heard(data, received_s):
+        for message in self._heard(data, received_s, source):
             if self._supervisor is None and self.is_vehicle_known:
                 self._meet(received_s)
             if self._is_ignored(message):
@@ -245,11 +246,11 @@ class Component:
             inputs.append(report)
         return inputs
 
-    def _heard(self, data: bytes, received_s: float) -> Iterator[Message]:
+    def _heard(self, data: bytes, received_s: float, source: Source | None) -> Iterator[Message]:
         """Yield what is news, one after the other, and say that something valid came."""
         codec = self.codec
         before = (codec.named_frame_count, codec.vehicle_frame_count)
-        messages = codec.decode(data, received_s)
+        messages = codec.decode(data, received_s, source)
         if self.on_valid is not None and codec.named_frame_count > before[0]:
             self.on_valid(codec.vehicle_frame_count > before[1])
         for message in messages:

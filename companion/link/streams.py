@@ -278,6 +278,8 @@ class LinkStatistics:
     position_hz: float | None
     round_trip_s: float | None
     copied_positions: int = 0
+    excess_bytes: int = 0
+    excess_frames: int = 0
 
     def line(self) -> str:
         """Return it in one line, for the record of a flight and the log."""
@@ -292,6 +294,8 @@ class LinkStatistics:
         ]
         if self.copied_positions:
             parts.append(f"positions twice or too late {self.copied_positions}")
+        if self.excess_bytes or self.excess_frames:
+            parts.append(f"not read {self.excess_bytes} B, {self.excess_frames} frames")
         if self.lost_percent is not None:
             parts.append(f"lost {self.lost_percent:.2f} % of the autopilot's")
         if self.position_hz is not None:
@@ -352,7 +356,8 @@ class Meter:
         round_trip_s: float | None = None,
     ) -> LinkStatistics:
         """Return the statistics up to now; rates are those since the last of this series."""
-        counts = (now_s, codec.frame_count, codec.byte_count, self.bytes_out)
+        seen = codec.counts
+        counts = (now_s, seen.frames, seen.bytes_in, self.bytes_out)
         before = self._before.get(series)
         self._before[series] = counts
         rates: list[float | None] = [None] * 3
@@ -366,12 +371,12 @@ class Meter:
             came, lost = codec.lost_frames.get(autopilot, (0, 0))
             lost_percent = 100.0 * lost / (came + lost) if came else None
         return LinkStatistics(
-            bytes_in=codec.byte_count,
+            bytes_in=seen.bytes_in,
             bytes_out=self.bytes_out,
-            frames_in=codec.frame_count,
+            frames_in=seen.frames,
             frames_out=self.frames_out,
-            bad_frames=codec.bad_frame_count,
-            refused_frames=codec.refused_frame_count,
+            bad_frames=seen.bad_frames,
+            refused_frames=seen.refused_frames,
             unsent_frames=self.unsent_frames,
             lost_percent=lost_percent,
             frames_per_s=rates[0],
@@ -380,4 +385,6 @@ class Meter:
             position_hz=position_hz,
             round_trip_s=round_trip_s,
             copied_positions=self.copied_positions,
+            excess_bytes=seen.excess_bytes,
+            excess_frames=seen.excess_frames,
         )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import os
 import socket
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -42,6 +43,9 @@ class Transport(Protocol):
 
     def send(self, data: bytes) -> bool:
         """Send now or not at all; return whether it left."""
+
+    def knows(self, speaker: Any) -> bool:
+        """Whether it is our line's other end, or was adopted."""
 
     def adopt(self, speaker: Any, now_s: float, *, is_vehicle: bool) -> None:
         """Take that a valid frame came from `speaker`, of the vehicle's system or of another."""
@@ -136,6 +140,10 @@ class Reconnecting:
     def send(self, data: bytes) -> bool:
         """Send now or not at all; return whether it left."""
 
+    def knows(self, speaker: Any) -> bool:  # noqa: ARG002 - there is one
+        """Whether it is our line's other end."""
+        return True
+
     def adopt(self, speaker: Any, now_s: float, *, is_vehicle: bool) -> None:
         """Do nothing: there is one other end, and we chose it."""
 
@@ -180,6 +188,10 @@ class Reconnecting:
 
 
 _PEERS_MAX = 4
+_DATAGRAM_MAX = 65_535
+_DATAGRAMS_AT_ONCE = 128
+# The kernel gives what it may; it counts a datagram as 768 bytes at least.
+_BUFFER_BYTES = 4 << 20
 # A peer that has said nothing valid for so long may lose its place; heartbeats come every second.
 _SILENT_S = 5.0
 
@@ -215,10 +227,26 @@ class UdpTransport(asyncio.DatagramProtocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Take the socket over."""
         self._socket = cast(asyncio.DatagramTransport, transport)
-        self.handle = transport.get_extra_info("socket")
+        self.handle = ours = transport.get_extra_info("socket")
+        ours.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+        self._rest = socket.socket(fileno=os.dup(ours.fileno()))
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
-        """Hand the bytes over; `speaker` says meanwhile where they came from."""
+        """Hand over what the socket holds; `speaker` says meanwhile where bytes came from.
+
+        The event loop would bring one datagram a turn, and what waits in the socket behind those
+        of others is lost when that is full.
+        """
+        for _ in range(_DATAGRAMS_AT_ONCE):
+            self.speaker = addr
+            self._on_bytes(data)
+            try:
+                data, addr = self._rest.recvfrom(_DATAGRAM_MAX, socket.MSG_DONTWAIT)
+            except BlockingIOError:
+                return
+            except OSError as error:
+                self.error_received(error)
+                return
         self.speaker = addr
         self._on_bytes(data)
 
@@ -226,6 +254,10 @@ class UdpTransport(asyncio.DatagramProtocol):
     def peers(self) -> Sequence[Any]:
         """Return the addresses that were adopted."""
         return tuple(self._peers)
+
+    def knows(self, speaker: Any) -> bool:
+        """Whether it is whom we called, or was adopted."""
+        return self._is_connected or speaker in self._peers
 
     def adopt(self, speaker: Any, now_s: float, *, is_vehicle: bool) -> None:
         """Send to an address from now on, if there is a place for it."""
@@ -268,19 +300,20 @@ class UdpTransport(asyncio.DatagramProtocol):
     def connection_lost(self, _exc: Exception | None) -> None:
         """Note that the socket is gone."""
         self.is_up = False
+        self._rest.close()
         if not self._closed.done():
             self._closed.set_result(None)
 
     def send(self, data: bytes) -> bool:
         """Send a datagram to the peer or the peers; False where there is none."""
-        socket = self._socket
-        if socket is None or socket.is_closing() or self._is_full:
+        ours = self._socket
+        if ours is None or ours.is_closing() or self._is_full:
             return False
         if self._is_connected:
-            socket.sendto(data)
+            ours.sendto(data)
             return True
         for peer in self._peers:
-            socket.sendto(data, peer)
+            ours.sendto(data, peer)
         return bool(self._peers)
 
     async def close(self) -> None:

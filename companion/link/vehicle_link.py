@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import time
 from collections import deque
@@ -18,6 +19,7 @@ from companion.core.types import (
 )
 from companion.link.census import Census, Vehicle, autopilot_name
 from companion.link.component import Component, ComponentOptions
+from companion.link.intake import Intake, Source
 from companion.link.outputs import OutputListener
 from companion.link.parameters import Parameters
 from companion.link.service import Answer, OnEvent
@@ -42,11 +44,10 @@ OnStatistics = Callable[[float, Mapping[str, float | None]], None]
 
 _logger = logging.getLogger(__name__)
 
-# Chunks that wait for the control loop. It empties them within a millisecond; a loop that is
-# behind by this many has other troubles than the oldest bytes.
-_CHUNKS_MAX = 512
-_KEPT_MAX = 50_000
+_EARLY_MAX, _KEPT_MAX = 512, 50_000
 _STATISTICS_S = 60.0
+# A turn reads no longer than this and a slice: what else is due comes between.
+_READ_S = 0.001
 _SAMPLE_S = 1.0
 
 
@@ -69,15 +70,15 @@ class VehicleLink:
         self._url = url
         self._clock = clock
         self._signing = signing
-        self._chunks: deque[tuple[bytes, float, Any]] = deque(maxlen=_CHUNKS_MAX)
-        self._spoke: tuple[Any, float] = (None, 0.0)
+        self._spoke: tuple[Source, float] | None = None
         self._transport: Transport | None = None
         self._wake: Callable[[], None] = _nothing
         self.component = Component(options, self._send, parameters=parameters, signing=signing)
+        self._intake = Intake(self.component.codec.counts)
         self.component.on_event = self._event
         self.component.on_valid = self._adopt
         self._on_event: OnEvent | None = None
-        self._early: deque[tuple[float, str, str]] = deque(maxlen=_CHUNKS_MAX)
+        self._early: deque[tuple[float, str, str]] = deque(maxlen=_EARLY_MAX)
         self._kept: list[Input] = []
         self._on_statistics: OnStatistics | None = None
         self._sampled_s = float("-inf")
@@ -140,10 +141,16 @@ class VehicleLink:
             self._changed = False
             self.component.link_changed(self._clock())
         inputs, self._kept = self._kept, []
-        while self._chunks:
-            data, received_s, speaker = self._chunks.popleft()
-            self._spoke = (speaker, received_s)
-            inputs.extend(self.component.receive(data, received_s))
+        until_s = self._clock() + _READ_S
+        while taken := self._intake.take():
+            for data, received_s, source in taken:
+                self._spoke = (source, received_s)
+                inputs.extend(self.component.receive(data, received_s, source))
+            if self._clock() >= until_s:
+                break
+        if self._intake.has_more():
+            # Not at once: what else waits for the event loop comes first.
+            asyncio.get_running_loop().call_soon(self._wake)
         self._heard = self._heard or any(
             not isinstance(item, OperatorCommand | RateOverride) for item in inputs
         )
@@ -252,9 +259,11 @@ class VehicleLink:
         return self._transport is not None and self._transport.send(data)
 
     def _on_bytes(self, data: bytes) -> None:
-        speaker = None if self._transport is None else self._transport.speaker
-        self._chunks.append((data, self._clock(), speaker))
-        self._wake()
+        transport = self._transport
+        speaker = None if transport is None else transport.speaker
+        is_known = transport is None or transport.knows(speaker)
+        if self._intake.put(data, self._clock(), speaker, is_known=is_known):
+            self._wake()
 
     def _adopt(self, is_vehicle: bool) -> None:
         """Have the answers sent to whoever just said something valid.
@@ -262,15 +271,16 @@ class VehicleLink:
         Before anything is answered: what the vehicle is asked at once must reach it.
         """
         self.has_been_heard = True
-        speaker, now_s = self._spoke
-        if self._transport is not None:
-            self._transport.adopt(speaker, now_s, is_vehicle=is_vehicle)
+        if self._transport is not None and self._spoke is not None:
+            source, now_s = self._spoke
+            self._transport.adopt(source.speaker, now_s, is_vehicle=is_vehicle)
+            source.know(self._intake, is_known=self._transport.knows(source.speaker))
 
     def _on_change(self, is_up: bool) -> None:
         _logger.warning("link %s: %s", "is up" if is_up else "was lost", self._url)
         self._changed = is_up
         self._heard = self._told = False
-        self._chunks.clear()
+        self._intake = Intake(self.component.codec.counts)
         if is_up:
             self._watch.link_up(self._clock())
         self._wake()
@@ -345,8 +355,8 @@ class Watch:
         self._before = self._counts()
 
     def _counts(self) -> tuple[int, int, int]:
-        codec = self._component.codec
-        return codec.byte_count, codec.frame_count, codec.refused_frame_count
+        counts = self._component.codec.counts
+        return counts.bytes_in, counts.frames, counts.refused_frames
 
     def look(self, now_s: float) -> None:
         """Say what is new; called at every step."""

@@ -266,7 +266,7 @@ def test_a_stray_start_costs_no_message_behind_it() -> None:
     stray = bytes([0xFD, 200, 0, 0, 1, 1, 1, 0, 0, 0])  # claims 200 bytes of a HEARTBEAT
     messages = codec.decode(stray + HEARTBEAT * 12, 0.0)
     assert len(messages) == 12
-    assert codec.dropped_byte_count == len(stray)
+    assert codec.counts.dropped_bytes == len(stray)
 
 
 def test_a_start_without_an_end_holds_nothing_up_for_long() -> None:

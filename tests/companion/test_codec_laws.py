@@ -94,4 +94,4 @@ def test_the_buffer_stays_bounded(data: bytes) -> None:
     codec = Codec()
     for _ in range(5):
         codec.decode(data, 0.0)
-    assert len(codec._framer._buffer) < 300
+    assert len(codec._source.framer._held) < 300

@@ -177,7 +177,7 @@ def test_nobody_but_the_autopilot_describes_the_vehicle(
         frame += message_id.to_bytes(3, "little") + b"\x01" * size
         check = mavlink.x25crc(frame[1:] + bytes([kind.crc_extra])).crc
         assert met.receive(frame + check.to_bytes(2, "little"), 1.0) == []
-    assert met.codec.frame_count == 5
+    assert met.codec.counts.frames == 5
     assert not heard
     assert met.mission_active is None
     assert set(FROM_ANYONE) == FROM_ANYONE_TOO

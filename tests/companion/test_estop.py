@@ -153,6 +153,24 @@ def test_a_line_of_gpiod_is_an_input_with_its_pull_up(monkeypatch: pytest.Monkey
     assert line.fileno() is None
 
 
+class Chattering(FakeRequest):
+    """A contact that never comes to rest: there is always another edge."""
+
+    def wait_edge_events(self, _timeout: object) -> bool:
+        self.events = ["falling", "rising"]
+        return True
+
+
+def test_a_contact_that_chatters_is_pressed_and_holds_up_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "gpiod", fake_module(Chattering()))
+    line = GpiodLevel("/dev/null", 5, key="safety.estop_line")
+    line.open()
+    assert line.is_high()
+    line.close()
+
+
 def test_a_line_that_is_taken_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     module = fake_module(OSError(16, "Device or resource busy"))
     monkeypatch.setitem(__import__("sys").modules, "gpiod", module)

@@ -113,7 +113,7 @@ async def test_wrong_baud_is_bytes_without_frames(
     far, device = terminal
     bench = await opened(f"serial:{device}:57600")
     os.write(far, bytes((37 * k) % 251 for k in range(400)))
-    await bench.until(lambda: bench.link.component.codec.byte_count == 400)
+    await bench.until(lambda: bench.link.component.codec.counts.bytes_in == 400)
     bench.pass_time(4.0)
     (said,) = bench.said(caplog)
     assert "400 bytes arrive but no MAVLink" in said
@@ -128,7 +128,7 @@ async def test_a_wire_with_some_noise_is_called_silent(
     far, device = terminal
     bench = await opened(f"serial:{device}:57600")
     os.write(far, b"\x00\xff\x00")
-    await bench.until(lambda: bench.link.component.codec.byte_count == 3)
+    await bench.until(lambda: bench.link.component.codec.counts.bytes_in == 3)
     bench.pass_time(4.0)
     (said,) = bench.said(caplog)
     assert "nothing arrives; check that TX is wired to RX" in said

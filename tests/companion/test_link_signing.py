@@ -48,7 +48,7 @@ def count(guard: Signing, *frames: bytes) -> int:
     """Return how many frames are believed."""
     codec = Codec(accept=guard.accepts)
     codec.decode(b"".join(frames), 1.0)
-    return codec.frame_count
+    return codec.counts.frames
 
 
 def test_frames_of_a_station_with_the_key_are_believed() -> None:

@@ -51,9 +51,9 @@ def test_broken_frames_are_counted_apart_from_noise() -> None:
     broken = bytearray(frames([0]))
     broken[12] ^= 1
     codec.decode(b"noise" + bytes(broken) + frames([1]), 1.0)
-    assert codec.frame_count == 1
-    assert codec.bad_frame_count >= 1
-    assert codec.byte_count == 5 + 2 * len(broken)
+    assert codec.counts.frames == 1
+    assert codec.counts.bad_frames >= 1
+    assert codec.counts.bytes_in == 5 + 2 * len(broken)
 
 
 def test_what_goes_out_and_what_cannot_are_counted() -> None:

@@ -217,7 +217,10 @@ def test_line_is_asked_for_with_the_clock_of_the_control_loop(
     edges = GpiodEdges("gpiochip0", 24, pull="up")
     assert edges.read() == []
     edges.open()
-    assert edges.read() == [Edge(1.5, 1), Edge(1.6, 2), Edge(1.7, 3)]
+    # What comes while it is read is read the next time: of a wire that hums there is no end.
+    assert edges.read() == [Edge(1.5, 1), Edge(1.6, 2)]
+    assert edges.read() == [Edge(1.7, 3)]
+    assert edges.read() == []
     asked = module.__dict__["asked"]
     assert asked["path"] == str(dev / "gpiochip0")
     assert asked["config"] == {
