@@ -66,6 +66,8 @@ LEAVE_CLOSED_S = 3.0
 # sign of life to the autopilot's watchdog (10 Hz), and not just before a position at 20 Hz.
 STEP_MAX_S = 0.06
 
+# Only from then on is it said in flight that nothing reaches the disk: a card is slow now and then.
+TOLD_AFTER_S = 5.0
 # The record gets the treated ground so often while it grows.
 COVERAGE_EVERY_S = 0.1
 
@@ -240,7 +242,7 @@ class ControlLoop:
         if fault is None or not self._has_begun or record.saved_age_s > close_after_s:
             self._told_record = None
             return None if fault is None else f"journal: {fault}"
-        if self._told_record is None:
+        if self._told_record is None and record.saved_age_s > TOLD_AFTER_S:
             self._told_record = fault
             self._link.tell_fault(f"journal: {fault}; valves close after {close_after_s:g} s")
         return None

@@ -94,6 +94,9 @@ def test_a_flight_that_has_begun_goes_on_without_its_record() -> None:
 def test_in_flight_what_lasts_closes_and_both_are_told_once() -> None:
     flight = Flight()
     assert is_spraying(flight.fly(60))
+    flight.fault = "only 3 MB are free"
+    assert is_spraying(flight.fly(5))
+    assert not flight.told
     flight.fault, flight.saved_age_s = "database or disk is full", 59.9
     assert is_spraying(flight.fly(20))
     (told,) = flight.told
