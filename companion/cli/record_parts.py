@@ -40,24 +40,21 @@ def made_ready(folder: Path) -> Iterator[str]:
     A JournalError where there is no room for a flight. What cannot be looked after is said and
     left: an old journal is no reason not to fly.
     """
-    if not folder.is_dir():
-        return
-    # Who has not flown yet has nothing to look after.
     from companion.journal.folder import WARN_FREE_PERCENT, recover_folder, space_of
 
     try:
-        for found in recover_folder(folder):
+        for found in recover_folder(folder) if folder.is_dir() else ():
             yield f"journal: {found.path.name}: {found.outcome}: {found.text}"
     except (JournalError, *DAMAGE) as error:
         yield f"warning: journal: {one_line(error)}"
-    space = space_of(folder)
+    space = space_of(next(each for each in (folder, *folder.absolute().parents) if each.is_dir()))
     if space.free_bytes < FREE_MIN_BYTES:
         raise JournalError(
             f"journal folder {folder}: only {space.free_bytes / 1e6:.0f} MB are free, a flight "
             f"needs {FREE_MIN_BYTES / 1e6:.0f}; {_ROOM}, or set journal.folder to another disk"
         )
     if space.free_percent < WARN_FREE_PERCENT:
-        yield (f"warning: journal: only {space.free_percent:.0f} % of the disk is free; {_ROOM}")
+        yield f"warning: journal: only {space.free_percent:.0f} % of the disk is free; {_ROOM}"
 
 
 def follow(journal: Journal, link: VehicleLink, executor: PlanExecutor) -> None:

@@ -295,10 +295,11 @@ def test_before_a_flight_what_a_crash_left_is_recovered_and_nothing_is_removed(
     assert [path.name for path in journals(folder)] == before
 
 
+@pytest.mark.parametrize("place", [".", "not/yet/there"])
 def test_a_full_disk_is_refused_before_the_flight(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, monkeypatch: pytest.MonkeyPatch, place: str
 ) -> None:
     full = Space(total_bytes=10**12, free_bytes=10**6)
     monkeypatch.setattr("companion.journal.folder.space_of", lambda _folder: full)
     with pytest.raises(JournalError, match="only 1 MB are free, a flight"):
-        list(made_ready(folder))
+        list(made_ready(folder / place))
