@@ -8,7 +8,6 @@ same sprayer: no compensation, one look-ahead, and perfect knowledge of the whol
 from __future__ import annotations
 
 import heapq
-import json
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -49,7 +48,7 @@ from missions.maps.compiling import compiled_setup
 from sitl.anyang import EXAMPLE
 from sitl.earth import Earth
 from sitl.flight import MESSAGE_DELAY_S, FlightOptions, FlightResult, fly
-from sitl.fly_files import draw
+from sitl.fly_files import draw, write_result
 from sitl.knowledge import perfect_setup
 from sitl.outputs import SERVO_FRAME_S, WIRE_S
 from sitl.profile import MeasuredSet, PlantProfile, Pulsing, load_profile
@@ -84,7 +83,7 @@ POSITION_S = 0.004
 FINE_S, PLAN_S, LEASE_S = 0.002, 0.05, 0.3
 # So long before and after a boundary a change is judged, and from so near on its levels.
 AROUND_S, LEVEL_FROM_S, MISSED_BELOW, MOVED_M = 0.5, 0.2, 0.5, 0.1
-RATE_MIN_HZ, RATE_MAX_HZ = 4.0, 50.0
+RATE_MIN_HZ, RATE_MAX_HZ, FLIGHTS_MAX = 4.0, 50.0, 100
 # A receiver is rarely later than this, and an estimate farther from it is at fault.
 BEHIND_MAX_S, OFF_MAX_M = 0.25, 0.5
 
@@ -125,7 +124,7 @@ def prepare(options: AlongOptions) -> Bed:
     setup = compiled_setup(config)
     flight = read_flight(options.log, setup.limits.allows)
     states = flight.states
-    if setup.pumping is not None or setup.atomisers:
+    if setup.pumping is not None or setup.atomisers or setup.lag.up_time_s:
         raise ConfigError(
             f"{config.path}: --along needs PWM valves; it cannot judge pumps or atomisers"
         )
@@ -527,7 +526,9 @@ def _steps(strip: Strip, can: Any) -> Iterator[tuple[float, float, float]]:
 
 def fly_along(options: AlongOptions, say: Callable[[str], None]) -> dict[str, Any]:
     """Fly every method along the log, each flight over a map of its own; return the results."""
-    seeds = range(options.seed, options.seed + max(options.flights, 1))
+    if not (options.seed >= 0 and 1 <= options.flights <= FLIGHTS_MAX):
+        raise ConfigError(f"give a --seed of 0 or more, and 1 to {FLIGHTS_MAX} --flights")
+    seeds = range(options.seed, options.seed + options.flights)
     beds = [prepare(replace(options, seed=seed)) for seed in seeds]
     rows, records = [], {}
     for method in METHODS:
@@ -552,8 +553,7 @@ def fly_along(options: AlongOptions, say: Callable[[str], None]) -> dict[str, An
         "notes": list(bed.notes),
     }
     if options.out is not None:
-        options.out.mkdir(parents=True, exist_ok=True)
-        (options.out / "result.json").write_text(json.dumps(result, indent=1), encoding="utf-8")
+        write_result(options.out, result)
         both = {method: records[method] for method in METHODS[:2]}
         draw(both, options.out / "along.png", say)
     return result

@@ -235,6 +235,11 @@ def fly(
     from companion.errors import ConfigError
 
     if along is not None:
+        if mission or scenario or fidelity or output or speed or corners or controller:
+            raise ConfigError(
+                "--along goes with --config, --plant, --position-rate-hz, --flights, --seed, --out "
+                "and --json; leave the others out"
+            )
         from sitl.along import AlongOptions, along_lines, fly_along
 
         result = fly_along(

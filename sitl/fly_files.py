@@ -28,21 +28,29 @@ MARGIN_M = 5.0
 
 def write_files(flown: Flown, folder: Path, say: Callable[[str], None]) -> list[Path]:
     """Write everything into `folder` and return the files; without matplotlib no picture."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        truth, result = folder / "truth.npz", folder / "result.json"
-        np.savez_compressed(truth, **truth_arrays(flown))
-        text = json.dumps(flown.as_json(), indent=1, allow_nan=False)
-        result.write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise ConfigError(f"--out {folder}: cannot be written ({reason})") from error
-    files = [truth, result]
+    files = write_result(folder, flown.as_json(), truth_arrays(flown))
     # A journal is the record of the companion's own decisions, which replay makes again.
     if flown.task.own is None:
         files.append(write_journal(flown, folder))
     record = flown.result.record
     return files + draw({record.meta.method: record}, folder / "flight.png", say)
+
+
+def write_result(
+    folder: Path, result: dict[str, Any], truth: dict[str, Any] | None = None
+) -> list[Path]:
+    """Write results into a folder, which is made, beside the truth; return the files."""
+    files = [folder / "truth.npz"] * bool(truth) + [folder / "result.json"]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if truth:
+            np.savez_compressed(files[0], **truth)
+        text = json.dumps(result, indent=1, allow_nan=False)
+        files[-1].write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise ConfigError(f"--out {folder}: cannot be written ({reason})") from error
+    return files
 
 
 def truth_arrays(flown: Flown) -> dict[str, Any]:

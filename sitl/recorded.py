@@ -322,7 +322,9 @@ def _ulog(path: Path) -> Recorded:
     with path.open("rb") as file:
         found = ULog(file, topics).data_list
     data = {each.name: each.data for each in found if not each.multi_id}
-    local, status, gps = (data[topic] for topic in topics)
+    local, status = (data[topic] for topic in topics[:2])
+    # Without its topic nothing is known of the receiver.
+    gps = data.get(topics[2], dict.fromkeys(("timestamp", "lat", "lon", "fix_type"), np.empty(0)))
     known = local["xy_global"] > 0
     local = {name: values[known] for name, values in local.items()}
     earth = Earth(float(local["ref_lat"][0]), float(local["ref_lon"][0]))

@@ -9,7 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+import sitl.along
+from companion.cli.app import app
 from companion.errors import ConfigError
 from sitl.along import (
     METHODS,
@@ -21,6 +24,7 @@ from sitl.along import (
     fly_method,
     prepare,
 )
+from sitl.anyang import EXAMPLE
 from sitl.earth import Earth
 from sitl.follow import Told, along
 from sitl.recorded import paths_of, read_flight, receiver_behind
@@ -221,6 +225,29 @@ def test_the_hidden_sprayer_has_the_period_and_the_lags_that_are_configured(log:
 def test_rates_by_which_nobody_sprays_are_refused(log: Path, rate_hz: float) -> None:
     with pytest.raises(ConfigError, match="--position-rate-hz"):
         prepare(AlongOptions(log=log, position_rate_hz=rate_hz))
+
+
+@pytest.mark.parametrize(
+    ("more", "why"),
+    [
+        (("--mission", "a.plan"), "leave the others out"),
+        (("--seed", "-1"), "--seed"),
+        (("--flights", "0"), "--flights"),
+        (("--config", str(EXAMPLE.parent / "pump" / "config.toml")), "needs PWM valves"),
+        (("--config", str(EXAMPLE.parent / "pump-sections" / "config.toml")), "needs PWM valves"),
+        (("--plant", "pump"), "as many PWM valves"),
+        (("--out", "/proc/nowhere"), "--out /proc/nowhere: cannot be written"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(
+    more: tuple[str, str], why: str, log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sitl.along, "METHODS", ("vrspray", "perfect"))
+    words = ["sitl", "fly", "--along", str(log), "--flights", "1", *more]
+    answer = CliRunner().invoke(app, words)
+    assert isinstance(answer.exception, ConfigError)
+    assert why in str(answer.exception)
+    assert "\n" not in str(answer.exception)
 
 
 # ------------------------------------------------------------------------------------- on the wire
