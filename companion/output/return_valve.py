@@ -67,6 +67,10 @@ class ReturnValve:
         """Return when it is to move next; None if never."""
         return self._moves[0][0] if self._moves else None
 
+    def opens_by(self, until_s: float) -> bool:
+        """Return whether it is to open by then."""
+        return any(is_open and at_s <= until_s for at_s, is_open in self._moves)
+
     def submit(self, plan: SprayPlan | None, now_s: float) -> list[tuple[float, bool]]:
         """Replace what has not happened by a plan, or by none; return the moves up to now."""
         done = self.run(now_s)

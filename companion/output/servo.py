@@ -23,7 +23,9 @@ __all__ = ["DITHER_S", "Order", "ServoExecutor", "ServoOptions"]
 
 _logger = logging.getLogger(__name__)
 
-_CLOSE_AGAIN_S = 0.05
+# How much later than one that left behind it an order may arrive: Linux holds back Wi-Fi frames
+# for a missing one for at most 0.1 s (mac80211, HT_RX_REORDER_BUF_TIMEOUT). A wire keeps the order.
+REORDER_S = 0.1
 # After a refusal the closing orders go on, but seldom: each costs a text on the pilot's screen.
 _REFRESH_FAULT_S = 5.0
 # An output takes what was ordered with its next frame, of 50 a second at the least.
@@ -61,6 +63,8 @@ class ServoExecutor(TimedExecutor):
         self._order = order
         self._send_staged = flush
         self._baud, self._is_signed = baud, is_signed
+        self._reorder_s = REORDER_S if baud is None else 0.0
+        self._again_at_s: dict[int, float] = {}
         self._guard = OutputGuard(options, say)
         self._is_joint = False
         self._budget = order_budget(baud=baud, is_px4=False, is_signed=is_signed)
@@ -130,7 +134,8 @@ class ServoExecutor(TimedExecutor):
         now_s = asyncio.get_running_loop().time()
         for valve in again:
             sent_us = self._sent_us[valve]
-            if sent_us is not None and not self._budget.left(now_s) < 1.0:
+            can_wait = self._budget.left(now_s) < 1.0 or self._rests_soon(valve, now_s)
+            if sent_us is not None and not can_wait:
                 self._give(valve, sent_us)
         self._flush()
 
@@ -166,7 +171,7 @@ class ServoExecutor(TimedExecutor):
         self._was_started = False
         self._sent_us = [None] * len(self._outputs)
         await super().stop()
-        await asyncio.sleep(_CLOSE_AGAIN_S)
+        await asyncio.sleep(REORDER_S)
         self._sent_us = [None] * len(self._outputs)
         self._close_all()
         _logger.info(
@@ -197,8 +202,10 @@ class ServoExecutor(TimedExecutor):
             return True
         if moved_us < CHANGE_MIN_US and pulse_us != full_us:
             return False
-        least_us = self._budget.trim_min_us(asyncio.get_running_loop().time())
-        if moved_us < least_us and not (least_us == CHANGE_MIN_US and pulse_us == full_us):
+        now_s = asyncio.get_running_loop().time()
+        least_us = self._budget.trim_min_us(now_s)
+        is_dear = moved_us < least_us and not (least_us == CHANGE_MIN_US and pulse_us == full_us)
+        if is_dear or self._rests_soon(valve, now_s):
             self._held_us[valve] = pulse_us
             return False
         return True
@@ -210,12 +217,16 @@ class ServoExecutor(TimedExecutor):
         now_s = asyncio.get_running_loop().time()
         if valve < self._count:
             sent_us = self._dithered_us(valve, pulse_us, now_s, is_turn=is_turn)
-        has_left = self._order(self._outputs[valve], sent_us)
+        has_left, before_us = self._order(self._outputs[valve], sent_us), self._sent_us[valve]
         self._sent_us[valve] = pulse_us if has_left else None
         if not has_left:
             self.unsent_count += 1
             return False
         self._given_us[valve], self._given_at_s[valve] = sent_us, now_s
+        if pulse_us != self._rest_us(valve):
+            self._again_at_s.pop(valve, None)
+        elif before_us not in (None, pulse_us) and self._reorder_s:
+            self._again_at_s[valve] = now_s + self._reorder_s
         self._guard.sent(valve, sent_us, now_s)
         self.order_count += 1
         if self._is_joint:
@@ -223,6 +234,21 @@ class ServoExecutor(TimedExecutor):
         else:
             self._budget.spend(1, now_s)
         return True
+
+    def _rest_us(self, output: int) -> int:
+        """Return the pulse that does no harm: shut, stopped, of a return valve open."""
+        return self._options.ends_us(output)[self._count <= output < self._first_drive]
+
+    def _rests_soon(self, output: int, now_s: float) -> bool:
+        """Return whether an order that can wait might arrive behind one to close.
+
+        On PX4 an order is one to all outputs.
+        """
+        return any(
+            self._rests_by(each, now_s, now_s + self._reorder_s)
+            for each in (range(len(self._outputs)) if self._is_joint else (output,))
+            if self._sent_us[each] not in (None, self._rest_us(each))
+        )
 
     def _dithered_us(self, valve: int, pulse_us: int, now_s: float, *, is_turn: bool) -> int:
         """Return the width to send for a pulse: one that the board sees move, if it is time.
@@ -283,11 +309,16 @@ class ServoExecutor(TimedExecutor):
         return DITHER_S if self._is_together else DITHER_S / self._count
 
     def _next_own_s(self) -> float | None:
-        times = [at_s for at_s in (self._refresh_at_s, self._dither_at_s) if at_s is not None]
+        own = (self._refresh_at_s, self._dither_at_s, *self._again_at_s.values())
+        times = [at_s for at_s in own if at_s is not None]
         return min(times, default=None)
 
     def _do_own(self, now_s: float) -> None:
         """Say orders again, and move those that are to be seen alive, when their turn has come."""
+        for output, at_s in list(self._again_at_s.items()):
+            if not now_s < at_s:
+                del self._again_at_s[output]
+                self._give(output, self._rest_us(output))
         if self._refresh_at_s is not None and not now_s < self._refresh_at_s:
             self._refresh_at_s = now_s + self._pause_s
             self._guard.look(now_s)
@@ -295,7 +326,8 @@ class ServoExecutor(TimedExecutor):
             self._next_refresh = (valve + 1) % len(self._outputs)
             sent_us = self._sent_us[valve]
             # What moves is said again by moving.
-            if sent_us is not None and not self._dithers(valve):
+            is_said = self._dithers(valve) or self._rests_soon(valve, now_s)
+            if sent_us is not None and not is_said:
                 self._give(valve, self._held_us.get(valve, sent_us))
         if self._dither_at_s is not None and not now_s < self._dither_at_s:
             # In the mean as often as said: a turn that came late delays no other.
@@ -311,12 +343,18 @@ class ServoExecutor(TimedExecutor):
         return is_open and self._options.dither_us > 0 and valve < self._count
 
     def _dither(self) -> None:
-        """Move the valve whose turn it is, or all of them; one that is closed stands still."""
+        """Move the valve whose turn it is, or all of them; one that is closed stands still.
+
+        So does one that closes soon. Where an order is one to all, others could then stand too
+        long for their boards.
+        """
+        now_s = asyncio.get_running_loop().time()
         turn = self._next_dither
         self._next_dither = (turn + 1) % self._count
         for valve in range(self._count) if self._is_together else (turn,):
             sent_us = self._sent_us[valve]
-            if sent_us is not None and self._dithers(valve):
+            closes = not self._is_joint and self._rests_soon(valve, now_s)
+            if sent_us is not None and self._dithers(valve) and not closes:
                 self._give(valve, self._held_us.get(valve, sent_us), is_turn=True)
 
 

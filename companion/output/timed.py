@@ -184,6 +184,20 @@ class TimedExecutor:
             return (0.0,) * self._count
         return self._plan.duty_at(now_s + _EARLY_S)
 
+    def _rests_by(self, output: int, now_s: float, until_s: float) -> bool:
+        """Return whether an output is planned to shut, stop or (return valve) open by then."""
+        plan, drive = self._plan, output - self._first_drive
+        if plan is None:
+            return False
+        if output < self._count:
+            ends = [each.at_s for each in plan.changes if each.valve == output and not each.duty]
+        elif drive < 0:
+            return self._return is not None and self._return.opens_by(until_s)
+        else:
+            changes = plan.drives[drive].changes if plan.drives else ()
+            ends = [each.at_s for each in changes if not each.fraction]
+        return any(now_s < at_s <= until_s for at_s in ends)
+
     def _follow(self, now_s: float, *, replaced: SprayPlan | None = None) -> None:
         """Bring every valve to what it should have now."""
         clock = asyncio.get_running_loop().time

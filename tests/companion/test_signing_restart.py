@@ -251,6 +251,7 @@ async def test_our_own_question_said_back_is_no_answer(tmp_path: Path) -> None:
         await peer.until(lambda: len(peer.of("TIMESYNC")) >= 2)
         for frame in [frame for frame in frames if frame[7] == 111]:
             wire.send(frame)
+        await asyncio.sleep(0.2)
         peer.enable()
         assert not await opens(peer)
 
