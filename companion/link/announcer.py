@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Iterator
 
 from companion.core.safety import ENVELOPE
@@ -27,6 +27,16 @@ SETTLED_S = 1.0
 TURN_S = 10.0
 # Who connects in the middle of a flight learns within this why nothing is sprayed.
 REMIND_S = 30.0
+# A reason that comes, goes and comes again within that time (positions once a second are too old
+# once a second) is news no more. Not so what somebody does, and what turns go through.
+UNSTEADY_CHANGES = 3
+_STEADY = ENVELOPE | {
+    Inhibit.ESTOP,
+    Inhibit.NOT_ENABLED,
+    Inhibit.NOT_ARMED,
+    Inhibit.WRONG_MODE,
+    Inhibit.RC_SWITCH,
+}
 # What no product is sprayed with is marked; as numbers for ground stations.
 TRAINING = {"water": 1.0, "dry": 2.0, "ground": 3.0}
 _LINE_MAX = 50
@@ -94,7 +104,8 @@ class Announcer:
         self._heartbeat, self._live = _Beat(HEARTBEAT_S), _Beat(LIVE_S)
         self._values = _Beat(VALUES_S)
         self._said: frozenset[Inhibit] | None = None
-        self._seen: frozenset[Inhibit] = frozenset()
+        self._seen = self._now = frozenset[Inhibit]()
+        self._changed_s = defaultdict[Inhibit, deque[float]](lambda: deque(maxlen=UNSTEADY_CHANGES))
         self._said_s = self._seen_s = float("-inf")
         self._waiting: deque[tuple[int, str]] = deque(maxlen=_WAITING_MAX)
         self._noted_s = float("-inf")
@@ -149,23 +160,39 @@ class Announcer:
                 yield self._encoder.text(severity, line)
 
     def _text(self, decision: Decision, now_s: float) -> Iterator[bytes]:
-        if decision.inhibits != self._seen:
-            self._seen, self._seen_s = decision.inhibits, now_s
-        if not self._is_news(decision.inhibits, now_s) or now_s - self._said_s < TEXT_S:
+        unsteady = self._unsteady(decision.inhibits, now_s)
+        steady = decision.inhibits - unsteady
+        if steady != self._seen:
+            self._seen, self._seen_s = steady, now_s
+        is_news = self._is_news(decision.inhibits, unsteady, now_s)
+        if not is_news or now_s - self._said_s < TEXT_S:
             return
         self._said, self._said_s = decision.inhibits, now_s
         severity = _WARNING if decision.inhibits & _LOUD else _INFO
         for line in reasons(decision.inhibits):
             yield self._encoder.text(severity, line)
 
-    def _is_news(self, now: frozenset[Inhibit], now_s: float) -> bool:
+    def _unsteady(self, now: frozenset[Inhibit], now_s: float) -> frozenset[Inhibit]:
+        """Return the reasons that have come and gone too often of late to be news."""
+        for one in (now ^ self._now) - _STEADY:
+            self._changed_s[one].append(now_s)
+        self._now = now
+        return frozenset(
+            one
+            for one, changed_s in self._changed_s.items()
+            if len(changed_s) == UNSTEADY_CHANGES and now_s - changed_s[0] < REMIND_S
+        )
+
+    def _is_news(self, now: frozenset[Inhibit], unsteady: frozenset[Inhibit], now_s: float) -> bool:
         """Return whether the reasons are to be told: one line for each change that is one."""
         if self._said is None:
             return True
+        if unsteady and not now:
+            return False  # no more than a moment between two that close
         is_old = now_s - self._said_s >= REMIND_S
-        if now == self._said:
+        change = (now ^ self._said) - unsteady
+        if not change:
             return is_old and bool(now) and Inhibit.NOT_ENABLED not in now
-        change = now ^ self._said
         if change & now & _LOUD:
             return True
         if change <= ENVELOPE:

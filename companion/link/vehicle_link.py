@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -597,18 +598,22 @@ class Teller:
     FLICKER_S = 10.0
 
     def __init__(self) -> None:
-        self._said: str | None = None
-        self._said_s = float("-inf")
-        self._has_cleared = True
+        self._said_s: dict[str, float] = {}
+        self._lasting: str | None = None
 
     def news(self, finding: Finding | None, now_s: float) -> Finding | None:
         """Return the finding if it is to be said now."""
         # The counts in a text grow; what is found is named by its short form.
         if finding is None:
-            self._has_cleared = True
+            self._lasting = None
             return None
-        pause_s = self.FLICKER_S if self._has_cleared else self.AGAIN_S
-        if finding.short == self._said and now_s - self._said_s < pause_s:
+        short = finding.short
+        pause_s = self.AGAIN_S if short == self._lasting else self.FLICKER_S
+        # Two that take turns are told no more often than one that comes and goes.
+        self._said_s = {
+            key: at_s for key, at_s in self._said_s.items() if now_s - at_s < self.AGAIN_S
+        }
+        if now_s - self._said_s.get(short, -math.inf) < pause_s:
             return None
-        self._said, self._said_s, self._has_cleared = finding.short, now_s, False
+        self._said_s[short], self._lasting = now_s, short
         return finding

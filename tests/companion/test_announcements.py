@@ -37,6 +37,40 @@ def test_reasons_that_flicker_are_told_now_and_then(peer: Peer, component: Compo
     assert 1 <= len(peer.texts()) <= 3
 
 
+def test_what_comes_and_goes_each_second_is_told_every_half_minute_and_arming_at_once(
+    peer: Peer, component: Component
+) -> None:
+    # Positions once a second: held for longer than a change has to last, and loud ones among them.
+    told_s = []
+    for turn in range(20 * 120):
+        now_s = turn * 0.05
+        flicker = Inhibit.SPEED_DISAGREES if now_s % 2.6 > 1.2 else Inhibit.STALE_POSITION
+        # Armed after a minute, and disabled at last: what is done by hand is told all the same.
+        on_ground = {Inhibit.NOT_ARMED} if now_s < 60.0 else set()
+        by_hand = {Inhibit.NOT_ENABLED} if now_s >= 100.0 else set()
+        component.tick(inhibited(flicker, *on_ground, *by_hand), now_s)
+        told_s += [now_s] * (len(peer.texts()) - len(told_s))
+    assert sum(at_s > 10.0 for at_s in told_s) <= 4 + 2
+    assert any(60.0 <= at_s <= 62.0 for at_s in told_s)
+    assert any(100.0 <= at_s <= 102.0 for at_s in told_s)
+
+
+def test_between_two_that_close_it_is_not_called_ready(peer: Peer, component: Component) -> None:
+    for turn in range(20 * 60):
+        now_s = turn * 0.05
+        is_old = now_s % 2.4 > 1.2
+        component.tick(inhibited(*([Inhibit.STALE_POSITION] if is_old else [])), now_s)
+    assert peer.texts() == [*(["Spray: ready", "Spray off: position too old"] * 2)]
+
+
+def test_what_was_unsteady_is_told_when_it_has_settled(peer: Peer, component: Component) -> None:
+    for turn in range(20 * 80):
+        now_s = turn * 0.05
+        is_old = now_s < 30.0 and now_s % 2.4 > 1.2
+        component.tick(inhibited(*([Inhibit.STALE_POSITION] if is_old else [])), now_s)
+    assert peer.texts()[-1] == "Spray: ready"
+
+
 def test_turns_of_a_flight_are_no_news_and_a_long_stand_is(
     peer: Peer, component: Component
 ) -> None:
