@@ -34,6 +34,7 @@ class Flown:
     period_s: float
     least_l_min: float  # of one valve
     full_l_min: float
+    slow_m_s: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +54,13 @@ def judge(flown: Flown) -> Verdict:
     turning = np.zeros(len(nose), dtype=np.bool_)
     for row in np.flatnonzero(yaw_deg_s > TURNING_DEG_S):
         turning[max(row - round(STAYS_S / step_s), 0) : row + round(STAYS_S / step_s) + 1] = True
+    east_m_s, north_m_s = (np.gradient(each, step_s) for each in (flown.east_m, flown.north_m))
+    ahead_m_s = east_m_s * sin + north_m_s * cos
+    spin = np.gradient(nose, step_s)
+    # The fastest point of the boom: one of its strips' middles at an end.
+    ends_m = [right for right, _, _ in flown.strips]
+    foremost_m_s = np.maximum(ahead_m_s - spin * min(ends_m), ahead_m_s - spin * max(ends_m))
+    is_fast = np.hypot(east_m_s, north_m_s) >= flown.slow_m_s
     field = shapely.union_all([zone for zone, _ in flown.zones])
     shapely.prepare(field)
     sums = np.zeros((3, 2))
@@ -75,7 +83,8 @@ def judge(flown: Flown) -> Verdict:
         for side_m in (-half_m, half_m):
             counts &= shapely.contains_xy(field, x + cos * side_m, y - sin * side_m)
         flow = asked_p / flown.period_s / ML_S_PER_L_MIN
-        can = (flow >= 0.98 * flown.least_l_min) & (flow <= 1.02 * flown.full_l_min)
+        can = (flow >= 0.98 * flown.least_l_min) & (flow <= 1.02 * flown.full_l_min) & is_fast
+        can &= (ahead_m_s - spin * right_m >= 0.0) | (foremost_m_s <= 0.0)
         wrong = np.abs(given_p - asked_p)
         for row, which in enumerate((counts & can, counts & can & turning, counts & ~can)):
             sums[row] += wrong[which].sum(), asked_p[which].sum()

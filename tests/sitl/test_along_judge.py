@@ -31,6 +31,7 @@ def test_both_judges_find_the_same(method: str, tmp_path: Path) -> None:
             period_s=bed.setup.pwm.period_s,
             least_l_min=curve.flow_l_min[0] / count,
             full_l_min=curve.flow_l_min[-1] / count,
+            slow_m_s=bed.setup.limits.speed_min_m_s,
         )
     )
     assert other.misapplied_percent == pytest.approx(ours["misapplied_percent"], abs=0.15)
