@@ -239,7 +239,7 @@ class ControlLoop:
             return None
         record, close_after_s = self._required
         fault = record.fault
-        if fault is None or not self._has_begun or record.saved_age_s > close_after_s:
+        if fault is None or not self._has_begun or not record.saved_age_s <= close_after_s:
             self._told_record = None
             return None if fault is None else f"journal: {fault}"
         if self._told_record is None and record.saved_age_s > TOLD_AFTER_S:

@@ -315,6 +315,8 @@ class Journal:
         """Write what is left and make one closed file of it; may be called twice."""
         self._give_up_s = min(self._give_up_s, time.monotonic() + ROOM_WITHIN_S)
         self._closing.set()
+        if self._writer.fault is not None:
+            _logger.warning("journal: %s: make room within %g s", self.fault, ROOM_WITHIN_S)
         self._rows.put(None)  # wakes the writer at once
         self._thread.join(CLOSE_WITHIN_S)
         if self._thread.is_alive():
