@@ -76,9 +76,6 @@ class _Wire:
     is_up = True
     speaker = None
 
-    def knows(self, _speaker: object) -> bool:
-        return True
-
     def adopt(self, speaker: object, now_s: float, *, is_vehicle: bool) -> None:
         """Do nothing: there is one other end."""
 

@@ -24,8 +24,8 @@ UNREAD_COST = 0.1
 KNOWN_BYTES = (2e6, 1 << 20)
 VEHICLE_FRAMES, OTHER_FRAMES, OTHERS_MAX = (1000, 200), (100, 50), 16
 # Then each stranger, of whom a heartbeat of 21 bytes is enough, and all of them together.
-STRANGER_BYTES, STRANGERS_BYTES = (16e3, 4096), (64e3, 16_384)
-STRANGER_FRAMES, STRANGERS_FRAMES = (50, 20), (400, 80)
+STRANGER_BYTES, STRANGERS_BYTES = (16e3, 4096), (48e3, 12_288)
+STRANGER_FRAMES = (50, 20)
 
 
 class Budget:
@@ -56,20 +56,15 @@ class Source:
         self.waiting: deque[tuple[int, bytes, float]] = deque()
         self._bytes: tuple[Budget, ...] = ()
         self._frames: dict[Any, Budget] = {}
-        self._all_frames: Budget | None = None
 
-    def know(self, intake: Intake, *, is_known: bool) -> None:
+    def know(self, strangers: Budget, *, is_known: bool) -> None:
         """Give it what its kind may cost, where it has become of another kind."""
         if is_known is self.is_known:
             return
         self.is_known = self.framer.may_split = is_known
-        if is_known:
-            self._bytes, self._all_frames = (Budget(*KNOWN_BYTES),), None
-            self._frames = {None: Budget(*VEHICLE_FRAMES)}
-        else:
-            self._bytes = (Budget(*STRANGER_BYTES), intake.strangers_bytes)
-            self._all_frames = intake.strangers_frames
-            self._frames = {None: Budget(*STRANGER_FRAMES)}
+        self._frames = {None: Budget(*(VEHICLE_FRAMES if is_known else STRANGER_FRAMES))}
+        own = Budget(*(KNOWN_BYTES if is_known else STRANGER_BYTES))
+        self._bytes = (own,) if is_known else (own, strangers)
 
     def may_read(self, count: int, now_s: float) -> bool:
         """Whether so many more bytes may wait."""
@@ -84,9 +79,7 @@ class Source:
             key = key if len(self._frames) <= OTHERS_MAX else ()
             self._frames.setdefault(key, Budget(*OTHER_FRAMES))
         cost = 1.0 if is_read else UNREAD_COST
-        return self._frames[key].spend(cost, now_s) and (
-            self._all_frames is None or self._all_frames.spend(cost, now_s)
-        )
+        return self._frames[key].spend(cost, now_s)
 
 
 class Intake:
@@ -95,14 +88,13 @@ class Intake:
     def __init__(self, counts: Counts) -> None:
         self._counts = counts
         self._sources: dict[Any, Source] = {}
-        self.strangers_bytes = Budget(*STRANGERS_BYTES)
-        self.strangers_frames = Budget(*STRANGERS_FRAMES)
+        self.strangers = Budget(*STRANGERS_BYTES)
         self._number = 0
 
     def put(self, data: bytes, at_s: float, speaker: Any, *, is_known: bool) -> bool:
         """Have bytes wait as far as they may; return whether any do."""
         source = self._source(speaker)
-        source.know(self, is_known=is_known)
+        source.know(self.strangers, is_known=is_known)
         had = len(source.waiting)
         # Of a stranger's datagram all is read, or nothing.
         size = SLICE_BYTES if is_known else max(len(data), 1)

@@ -44,9 +44,6 @@ class Transport(Protocol):
     def send(self, data: bytes) -> bool:
         """Send now or not at all; return whether it left."""
 
-    def knows(self, speaker: Any) -> bool:
-        """Whether it is our line's other end, or was adopted."""
-
     def adopt(self, speaker: Any, now_s: float, *, is_vehicle: bool) -> None:
         """Take that a valid frame came from `speaker`, of the vehicle's system or of another."""
 
@@ -140,10 +137,6 @@ class Reconnecting:
     def send(self, data: bytes) -> bool:
         """Send now or not at all; return whether it left."""
 
-    def knows(self, speaker: Any) -> bool:  # noqa: ARG002 - there is one
-        """Whether it is our line's other end."""
-        return True
-
     def adopt(self, speaker: Any, now_s: float, *, is_vehicle: bool) -> None:
         """Do nothing: there is one other end, and we chose it."""
 
@@ -232,36 +225,31 @@ class UdpTransport(asyncio.DatagramProtocol):
         self._rest = socket.socket(fileno=os.dup(ours.fileno()))
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
-        """Hand over what the socket holds; `speaker` says meanwhile where bytes came from.
+        """Hand over what the socket holds; `speaker` says where it came from, if we called nobody.
 
         The event loop would bring one datagram a turn, and what waits in the socket behind those
         of others is lost when that is full.
         """
-        for _ in range(_DATAGRAMS_AT_ONCE):
-            self.speaker = addr
+        left = _DATAGRAMS_AT_ONCE
+        while True:
+            self.speaker = None if self._is_connected else addr
             self._on_bytes(data)
+            left -= 1
+            if left <= 0:
+                return
             try:
                 data, addr = self._rest.recvfrom(_DATAGRAM_MAX, socket.MSG_DONTWAIT)
-            except BlockingIOError:
+            except OSError:  # there is no more; or what the event loop will be told of
                 return
-            except OSError as error:
-                self.error_received(error)
-                return
-        self.speaker = addr
-        self._on_bytes(data)
 
     @property
     def peers(self) -> Sequence[Any]:
         """Return the addresses that were adopted."""
         return tuple(self._peers)
 
-    def knows(self, speaker: Any) -> bool:
-        """Whether it is whom we called, or was adopted."""
-        return self._is_connected or speaker in self._peers
-
     def adopt(self, speaker: Any, now_s: float, *, is_vehicle: bool) -> None:
         """Send to an address from now on, if there is a place for it."""
-        if self._is_connected or speaker is None:
+        if speaker is None:
             return
         known = self._peers.get(speaker)
         if known is None:

@@ -262,8 +262,7 @@ class VehicleLink:
     def _on_bytes(self, data: bytes) -> None:
         transport = self._transport
         speaker = None if transport is None else transport.speaker
-        is_known = transport is None or transport.knows(speaker)
-        if self._intake.put(data, self._clock(), speaker, is_known=is_known):
+        if self._intake.put(data, self._clock(), speaker, is_known=self._knows(speaker)):
             self._wake()
 
     def _adopt(self, is_vehicle: bool) -> None:
@@ -275,7 +274,11 @@ class VehicleLink:
         if self._transport is not None and self._spoke is not None:
             source, now_s = self._spoke
             self._transport.adopt(source.speaker, now_s, is_vehicle=is_vehicle)
-            source.know(self._intake, is_known=self._transport.knows(source.speaker))
+            source.know(self._intake.strangers, is_known=self._knows(source.speaker))
+
+    def _knows(self, speaker: Any) -> bool:
+        """Whether it is the only other end of our line, or was adopted."""
+        return speaker is None or (self._transport is not None and speaker in self._transport.peers)
 
     def _on_change(self, is_up: bool) -> None:
         _logger.warning("link %s: %s", "is up" if is_up else "was lost", self._url)

@@ -41,10 +41,19 @@ CHANNELS = tuple(range(1, 7))
 _OTHER = mavlink.MAVLink(None, srcSystem=9, srcComponent=190)
 _BEAT = bytes(_OTHER.heartbeat_encode(6, 8, 0, 0, 4).pack(_OTHER))
 # What is sent: nothing; starts; heads that can be; whole frames of somebody else.
-KINDS = {"idle": b"", "starts": b"\xfe", "heads": b"\xfe\x18", "frames": _BEAT}
+KINDS = {
+    "idle": b"",
+    "starts": b"\xfe",
+    "heads": b"\xfe\x18",
+    "frames": _BEAT,
+    "a guest's heads": _BEAT + b"\xfe\x18" * 700,  # of a stranger that is adopted
+}
 # By link: which of them, and in chunks of how many bytes.
 RUNS = {
-    "udp": (("idle", 0), ("starts", 65_507), ("heads", 1400), ("heads", 64), ("frames", 1400)),
+    "udp": (
+        *(("idle", 0), ("starts", 65_507), ("heads", 1400), ("heads", 64)),
+        *(("frames", 1400), ("a guest's heads", 1400)),
+    ),
     "tcp": (("idle", 0), ("starts", 262_144), ("heads", 65_536), ("frames", 65_536)),
     "serial": (("idle", 0), ("starts", 4096), ("heads", 4096)),
 }

@@ -98,9 +98,6 @@ class UpAndDown:
 
     speaker = None
 
-    def knows(self, _speaker: object) -> bool:
-        return True
-
     def adopt(self, speaker: object, now_s: float, *, is_vehicle: bool) -> None:
         """Do nothing: there is one other end."""
 
