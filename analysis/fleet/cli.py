@@ -285,7 +285,6 @@ def serve(
 
     From another computer, open the link that is printed here, with its token.
     """
-    from analysis.fleet.serving import build_app
     from analysis.fleet.serving import serve as serve_page
     from analysis.fleet.store import Store
     from companion.cli.web_parts import own_address
@@ -301,7 +300,7 @@ def serve(
             raise ConfigError(f"{each}: there is no such file; give a PEM file")
     store = Store.at(fleet).existing()
     names = tuple(each.lower() for each in name or ())
-    doors = Doors(is_local=is_loopback(host), names=names)
+    doors = Doors(is_local=is_loopback(host), names=names, port=port)
     kept = kept_tokens(tokens or Path.home() / ".local/state/vrspray/fleet-tokens.json")
     guard = Guard(doors=doors, tokens=kept, names_by="--name", printed_by="vrspray fleet serve")
     listener = listen(host, port, port_by="--port", host_by="--host")
@@ -311,4 +310,4 @@ def serve(
     if doors.needs_token:
         link += f"#token={kept.view}"
     answer({"fleet": fleet, "url": link}, [f"the fleet's page: {link}"], as_json=as_json)
-    serve_page(build_app(store, guard, is_tls=tls is not None), listener, tls=tls)
+    serve_page(store, guard, listener, tls)

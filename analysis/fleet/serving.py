@@ -23,6 +23,7 @@ from analysis.fleet.summary import Chosen, summary_of
 from companion.errors import VrsprayError
 from companion.web.entrance import REFUSED, Guarded, add_sessions, server_of, unusable
 from companion.web.guard import API, Guard
+from companion.web.places import Places
 
 LOGIN_S = 12 * 3600
 # The same question within so long has the same answer: a summary takes a second of computing.
@@ -80,7 +81,7 @@ class Readings:
         return Reading(at_s=at_s, html=body_of(summary), files=files_of(summary))
 
 
-def build_app(store: Store, guard: Guard, *, is_tls: bool = False) -> Guarded:
+def build_app(store: Store, guard: Guard, places: Places, *, is_tls: bool = False) -> Guarded:
     """Return the application; nothing in it changes anything."""
     app = FastAPI(
         title="vrspray fleet",
@@ -124,7 +125,7 @@ def build_app(store: Store, guard: Guard, *, is_tls: bool = False) -> Guarded:
     async def static(name: str) -> Response:
         return _static(name)
 
-    return Guarded(app, guard)
+    return Guarded(app, guard, places)
 
 
 def _static(name: str) -> Response:
@@ -136,8 +137,12 @@ def _static(name: str) -> Response:
     return Response(content, media_type=_TYPES[Path(name).suffix])
 
 
-def serve(app: Guarded, listener: socket.socket, *, tls: tuple[str, str] | None = None) -> None:
+def serve(
+    store: Store, guard: Guard, listener: socket.socket, tls: tuple[str, str] | None = None
+) -> None:
     """Serve until Ctrl-C, or a signal to end."""
-    server = server_of(app, tls=tls, connections_max=100, shutdown_within_s=2)
+    places = Places()
+    app = build_app(store, guard, places, is_tls=tls is not None)
+    server = server_of(app, tls=tls, shutdown_within_s=2)
     with suppress(KeyboardInterrupt):
-        server.run(sockets=[listener])
+        server.run(sockets=[places.listening(listener)])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import json
+import shlex
 import socket
 import sys
 from collections.abc import Mapping, Sequence
@@ -126,8 +127,11 @@ def build_page(
         },
         "version": version("vrspray"),
     }
-    for line in invitation(config, doors, tokens):
-        note(line)
+    note(f"operator's page: {_place(config, doors)}")
+    if doors.needs_token:
+        # Never the links: what `run` prints is kept in the logs of services and containers.
+        words = _config_words(config, given)
+        note(f"its links: {shlex.join(('vrspray', 'token', 'show', *words))}")
     declarations = Declarations(config, link)
     obey = obeying(link, declarations)
     return OperatorPage(
@@ -143,7 +147,8 @@ def tokens_file(config: Config) -> Path:
 def doors_of(config: Config) -> Doors:
     """Return by which names the page may be called."""
     web = config.web
-    return Doors(is_local=is_loopback(web.host), names=tuple(map(str.lower, web.names)))
+    names = tuple(map(str.lower, web.names))
+    return Doors(is_local=is_loopback(web.host), names=names, port=web.port)
 
 
 def _doctor(config: Config, given: Sequence[str]) -> list[str]:
@@ -222,13 +227,21 @@ def obeying(link: VehicleLink, declarations: Declarations | None = None) -> Obey
     return obey
 
 
-def invitation(config: Config, doors: Doors, tokens: Tokens) -> list[str]:
-    """Return where the page is, a line each, and for phones its QR code."""
+def _place(config: Config, doors: Doors) -> str:
+    """Return where the page is."""
     web = config.web
     scheme = "http" if web.tls_certificate is None else "https"
-    host = "127.0.0.1" if doors.is_local else (web.names[0] if web.names else own_address(web.host))
+    if web.names and not doors.is_local:
+        name, _, port = web.names[0].partition(":")
+        return f"{scheme}://{name}:{port or web.port}/"
+    host = "127.0.0.1" if doors.is_local else own_address(web.host)
     bare = f"[{host}]" if ":" in host else host
-    place = f"{scheme}://{bare}:{web.port}/"
+    return f"{scheme}://{bare}:{web.port}/"
+
+
+def invitation(config: Config, doors: Doors, tokens: Tokens) -> list[str]:
+    """Return where the page is, a line each, and for phones its QR code."""
+    place = _place(config, doors)
     if not doors.needs_token:
         return [f"operator's page: {place}"]
     operate = f"{place}#token={tokens.operate}"

@@ -461,7 +461,8 @@ class WebTable(Table):
     )
     port: int = Field(default=8880, ge=1, le=65535, description="port to listen on")
     names: Annotated[tuple[Text, ...], Field(strict=False, max_length=20)] = Field(
-        default=(), description="other host names under which browsers may open the page"
+        default=(),
+        description="other host names of the page; of another port than web.port: name:port",
     )
     frame_ancestors: Annotated[tuple[Text, ...], Field(strict=False, max_length=20)] = Field(
         default=(), description="origins that may show the page in a frame, such as BlueOS"

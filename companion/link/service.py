@@ -79,6 +79,8 @@ class CommandState:
     may_enable: bool = True  # a command may; below, the page may
     page_may_enable: bool = False
     is_enabled: bool = False
+    # How often a stop was commanded since the last release; only the first changes anything.
+    stops: int = 0
     # When the consent last went, by whatever took it; None: it was given anew since.
     stopped_s: float | None = None
     # Whether a stop was commanded, in this run or before, and not ended by a DISABLE.
@@ -101,6 +103,8 @@ class CommandState:
         if self.is_enabled and not is_enabled:
             self.stopped_s = now_s
         self.is_enabled = is_enabled
+        if state is None or state.estop is not True:
+            self.stops = 0
         if not self.is_open:  # the disk is not waited for before all is closed
             self.parameters.keep_stop(self.is_stopped)
 
@@ -146,7 +150,10 @@ def _sprayer(command_state: CommandState, command: CommandReceived) -> Answer:
     if enable:
         command_state.enabled_by = (command.sender, command.sequence)
     wish = OperatorCommand(received_s=command.received_s, enable=enable, source=command.source)
-    return Answer(result=ACCEPTED, inputs=(wish,))
+    event = None
+    if not enable:
+        event, command_state.stops = _repeated(command_state), 0
+    return Answer(result=ACCEPTED, inputs=(wish,), event=event)
 
 
 def _without_enabling(command_state: CommandState, command: CommandReceived) -> Answer | None:
@@ -179,10 +186,22 @@ def _unless_admitted(command_state: CommandState, signing: Signing) -> Answer | 
 
 
 def _estop(command_state: CommandState, command: CommandReceived) -> Answer:
-    """Take an emergency stop, whatever its parameters: DO_SPRAYER 0 ends it."""
+    """Take an emergency stop, whatever its parameters: DO_SPRAYER 0 ends it.
+
+    Anybody may stop, as often as he likes: what is stopped already is only counted.
+    """
     command_state.stopped_s, command_state.is_stopped = command.received_s, True
+    command_state.stops += 1
+    if command_state.stops > 1:
+        is_told = str(command_state.stops).strip("0") == "1"
+        return Answer(result=ACCEPTED, event=_repeated(command_state) if is_told else None)
     stop = EstopReport(received_s=command.received_s, pressed=True, source="command")
     return Answer(result=ACCEPTED, inputs=(stop,), text="emergency stop", event="emergency stop")
+
+
+def _repeated(command_state: CommandState) -> str | None:
+    times = command_state.stops
+    return f"emergency stop, {times} times" if times > 1 else None
 
 
 def rate_override(command_state: CommandState, percent: float | None, received_s: float) -> Answer:

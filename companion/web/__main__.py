@@ -20,6 +20,7 @@ from companion.web.guard import Doors, Guard, Tokens
 from companion.web.live import Live
 from companion.web.page import RingReader
 from companion.web.parts import registered, uploads
+from companion.web.places import Places
 from companion.web.server import Orders, Site, build_app
 
 # The control loop comes first.
@@ -49,14 +50,17 @@ async def _serve(
     way = about["way_file"]
     live = Live(about, way_file=Path(way) if way else None, utc_s=time.time())
     orders = Orders(socket.socket(fileno=orders_fd))
-    doors = Doors(is_local=about["is_local"], names=tuple(about["names"]))
+    listener = socket.socket(fileno=listener_fd)
+    names, port = tuple(about["names"]), listener.getsockname()[1]
+    doors = Doors(is_local=about["is_local"], names=names, port=port)
     parts = registered()
     guard = Guard(doors=doors, tokens=Tokens(**about["tokens"]), uploads=uploads(parts))
     site = Site(live, orders, guard, about)
-    app = Guarded(build_app(site, parts), guard, ancestors=tuple(about["frame_ancestors"]))
+    places, ancestors = Places(), tuple(about["frame_ancestors"])
+    app = Guarded(build_app(site, parts), guard, places, ancestors=ancestors)
     certificate, key = about["tls_certificate"], about["tls_key"]
     tls = (certificate, key) if certificate else None
-    server = server_of(app, tls=tls, connections_max=200)
+    server = server_of(app, tls=tls)
 
     def read() -> None:
         os.eventfd_read(wake)
@@ -71,7 +75,7 @@ async def _serve(
     os.set_blocking(wake, False)
     asyncio.get_running_loop().add_reader(wake, read)
     orders.attach(end)
-    await server.serve(sockets=[socket.socket(fileno=listener_fd)])
+    await server.serve(sockets=[places.listening(listener)])
 
 
 if __name__ == "__main__":

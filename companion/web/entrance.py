@@ -6,7 +6,7 @@ The operator's page and the fleet's have it in common.
 from __future__ import annotations
 
 import asyncio
-import time
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Annotated, Any
 
@@ -18,10 +18,11 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.types import ASGIApp, Message, Receive, Send
 from starlette.types import Scope as Connection
 
-from companion.web.guard import API, COOKIE, Asked, Failures, Guard, Scope, session
+from companion.web.guard import API, COOKIE, Asked, Guard, Scope, session, since_start_s
+from companion.web.places import AT_ONCE, WAIT_S, Places
 
 BODY_BYTES_MAX = 4096
-SEND_WITHIN_S = 20.0
+BODY_WITHIN_S, SEND_WITHIN_S = 10.0, 20.0
 _CSP = (
     "default-src 'none'; script-src 'self'; worker-src 'self'; style-src 'self'; "
     "img-src 'self' data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
@@ -30,6 +31,7 @@ _CSP = (
 REFUSED: dict[int | str, dict[str, Any]] = {
     401: {"description": "no session"},
     403: {"description": "not from the page, or the session may only look"},
+    408: {"description": "too slow"},
     413: {"description": "too large"},
     415: {"description": "no JSON"},
     503: {"description": "the companion does not answer"},
@@ -43,7 +45,7 @@ class Body(BaseModel):
 
 
 class Login(Body):
-    """The token of the link or QR code that `run` prints."""
+    """The token of the link or QR code that `vrspray token show` prints."""
 
     token: Annotated[str, Field(min_length=1, max_length=200)]
 
@@ -58,9 +60,11 @@ class Access(BaseModel):
 class Guarded:
     """Refuses what comes from elsewhere, and adds the headers that keep a page to itself."""
 
-    def __init__(self, app: ASGIApp, guard: Guard, *, ancestors: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self, app: ASGIApp, guard: Guard, places: Places, *, ancestors: tuple[str, ...] = ()
+    ) -> None:
         self._app = app
-        self._guard = guard
+        self._guard, self._places = guard, places
         self._headers = {
             b"content-security-policy": (_CSP + " ".join(("'self'", *ancestors))).encode(),
             b"x-content-type-options": b"nosniff",
@@ -82,19 +86,34 @@ class Guarded:
             # A browser that does not read is let go; until then it costs one message.
             await asyncio.wait_for(send(message), SEND_WITHIN_S)
 
-        asked = asked_of(scope)
-        refusal = self._guard.refusal(asked, time.time())
+        with (
+            self._places.serving(scope["client"]) as keep,
+            suppress(TimeoutError, ConnectionError),
+        ):
+            app, receive = await self._answering(asked_of(scope), receive, keep)
+            await app(scope, receive, sent)
+
+    async def _answering(
+        self, asked: Asked, receive: Receive, keep: Callable[[], None]
+    ) -> tuple[ASGIApp, Receive]:
+        """Return what answers a request, and what that may still read."""
+        now_s = since_start_s()
+        refusal = self._guard.refusal(asked, now_s)
         if refusal is None and asked.method == "POST" and not self._guard.is_upload(asked.path):
-            body = await _body(receive)
-            if body is None:
-                refusal = 413, f"a request has at most {BODY_BYTES_MAX} bytes"
+            try:
+                async with asyncio.timeout(BODY_WITHIN_S):
+                    body = await _body(receive)
+            except TimeoutError:
+                refusal = 408, f"a request has to arrive within {BODY_WITHIN_S:g} s"
             else:
                 receive = _replay(body, receive)
-        with suppress(TimeoutError, ConnectionError):
-            if refusal is not None:
-                await JSONResponse({"detail": refusal[1]}, refusal[0])(scope, receive, sent)
-            else:
-                await self._app(scope, receive, sent)
+                if len(body) > BODY_BYTES_MAX:
+                    refusal = 413, f"a request has at most {BODY_BYTES_MAX} bytes"
+        if refusal is not None:
+            return JSONResponse({"detail": refusal[1]}, refusal[0]), receive
+        if self._guard.keeps_place(asked, now_s):
+            keep()
+        return self._app, receive
 
 
 def asked_of(scope: Connection) -> Asked:
@@ -103,16 +122,15 @@ def asked_of(scope: Connection) -> Asked:
     return Asked(method=scope["method"], path=scope["path"], headers=headers)
 
 
-async def _body(receive: Receive) -> bytes | None:
-    """Return a request's body; None where it is too large."""
+async def _body(receive: Receive) -> bytes:
+    """Return a request's body, or more than it may have."""
     body = b""
-    while True:
+    while len(body) <= BODY_BYTES_MAX:
         message = await receive()
         body += bytes(message.get("body", b""))
-        if len(body) > BODY_BYTES_MAX:
-            return None
         if message["type"] == "http.disconnect" or not message.get("more_body"):
-            return body
+            break
+    return body
 
 
 def _replay(body: bytes, receive: Receive) -> Receive:
@@ -137,27 +155,24 @@ async def unusable(_request: Request, error: Exception) -> Response:
 
 
 def add_sessions(app: FastAPI, guard: Guard, *, login_s: int, is_tls: bool) -> None:
-    """Add what opens a session by a token, and says what one may do."""
-    failures = Failures()
+    """Add what opens a session by a token, and says what one may do.
+
+    Wrong tokens are not counted: nobody guesses 256 bits, and behind a proxy all have one address.
+    """
 
     @app.get(f"{API}session", tags=["session"])
     async def access(request: Request) -> Access:
         """Return what one may do."""
-        scope = guard.scope_of(asked_of(request.scope), time.time())
+        scope = guard.scope_of(asked_of(request.scope), since_start_s())
         return Access(scope=scope, needs_token=guard.doors.needs_token)
 
-    @app.post(f"{API}session", tags=["session"], responses=REFUSED | {429: {"description": "wait"}})
-    async def log_in(login: Login, request: Request, response: Response) -> Access:
+    @app.post(f"{API}session", tags=["session"], responses=REFUSED)
+    async def log_in(login: Login, response: Response) -> Access:
         """Open a session by a token; the session is a cookie that scripts cannot read."""
-        address = "" if request.client is None else request.client.host
-        now_s = time.monotonic()
-        if failures.is_blocked(address, now_s):
-            raise HTTPException(429, "too many wrong tokens: wait a minute")
         scope = guard.tokens.scope_of(login.token)
         if scope == "none":
-            failures.failed(address, now_s)
             raise HTTPException(401, "this token is not valid; take the newest link")
-        value = session(guard.tokens, scope, int(time.time()) + login_s)
+        value = session(guard.tokens, scope, int(since_start_s()) + login_s)
         response.set_cookie(
             COOKIE,
             value,
@@ -173,10 +188,12 @@ def server_of(
     app: Guarded,
     *,
     tls: tuple[str, str] | None,
-    connections_max: int,
     shutdown_within_s: int | None = None,
 ) -> uvicorn.Server:
-    """Return what serves a page on a socket of ours; it says nothing of itself to strangers."""
+    """Return what serves a page on a socket of ours, which `Places` guards.
+
+    It says nothing of itself to strangers, and strangers write no line into its log.
+    """
     certificate, key = tls or (None, None)
     return uvicorn.Server(
         uvicorn.Config(
@@ -184,12 +201,13 @@ def server_of(
             http="h11",
             ws="none",
             lifespan="off",
-            log_level="warning",
+            log_level="error",
             access_log=False,
             server_header=False,
             proxy_headers=False,
-            limit_concurrency=connections_max,
-            timeout_keep_alive=15,
+            loop="asyncio",
+            backlog=AT_ONCE,
+            timeout_keep_alive=round(WAIT_S),
             timeout_graceful_shutdown=shutdown_within_s,
             h11_max_incomplete_event_size=16_384,
             ssl_certfile=certificate,

@@ -3,7 +3,9 @@
 A page in somebody's browser can send requests to any address. So the Host header must be an
 address of ours (a name that an attacker rebinds to our address is refused), and an order's Origin
 must be the page itself. A token opens a session with a scope: `view` or `operate`. The session is
-a signed cookie, so it outlives the page's process; a new token ends all sessions.
+a signed cookie, so it outlives the page's process; new tokens and a new start of the computer end
+all sessions. They are timed since that start: a board without a battery for its clock does not know
+the date until it is told, and what it is told is no reason to end a session, or to let one live.
 """
 
 from __future__ import annotations
@@ -15,8 +17,9 @@ import json
 import os
 import re
 import secrets
-from collections import deque
+import time
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Literal
 from urllib.parse import urlsplit
@@ -28,9 +31,20 @@ RANK: dict[Scope, int] = {"none": 0, "view": 1, "operate": 2}
 TOKEN_BYTES = 32
 _NETLOC = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9_.-]+)(:[0-9]{1,5})?", re.IGNORECASE)
 COOKIE = "vrspray_session"
-# Guesses of a token from one address, in a minute.
-FAILURES_MAX, FAILURES_S = 10, 60.0
-ADDRESSES_MAX = 1000
+
+
+@cache
+def _start() -> str:
+    """Return what names this start of the computer; where there is no name, of this process."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii")
+    except OSError:
+        return secrets.token_hex()
+
+
+def since_start_s() -> float:
+    """Return the time since the computer started; nobody sets this clock."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,8 +63,8 @@ class Tokens:
 
     @property
     def key(self) -> bytes:
-        """Return the key that signs sessions; another with each new pair of tokens."""
-        return hashlib.sha256(f"session {self.view} {self.operate}".encode()).digest()
+        """Return the key that signs sessions; another with new tokens or a new start."""
+        return hashlib.sha256(f"session {_start()} {self.view} {self.operate}".encode()).digest()
 
 
 def new_tokens(path: Path) -> Tokens:
@@ -150,10 +164,15 @@ def is_loopback(host: str) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Doors:
-    """By which names the page may be called; `is_local`: it listens on loopback only."""
+    """By which names the page may be called; `is_local`: it listens on loopback only.
+
+    A name stands for itself at `port` and at the port that browsers leave out, unless it has one:
+    what other ports of that name serve is not the page.
+    """
 
     is_local: bool
     names: tuple[str, ...] = ()
+    port: int = 0
 
     @property
     def needs_token(self) -> bool:
@@ -172,7 +191,7 @@ class Doors:
         host = host_of(netloc)
         if host is None:
             return False
-        if is_loopback(host) or host in self.names:
+        if is_loopback(host) or self._is_named(netloc):
             return True
         if self.is_local:
             return False
@@ -182,38 +201,22 @@ class Doors:
             return host.endswith(".local")
         return True
 
+    def _is_named(self, netloc: str) -> bool:
+        netloc = netloc.lower()
+        name, _, port = netloc.rpartition(":")
+        return netloc in self.names or (port == str(self.port) and name in self.names)
+
     def allows_origin(self, origin: str, netloc: str) -> bool:
         """Return whether an order's Origin is the page itself, as this request calls it.
 
-        A proxy may add TLS or drop the port: then the name must be one that was given.
+        A proxy may add TLS or change the port: then the name must be one that was given.
         """
         scheme, separator, place = origin.partition("://")
         if not separator or scheme not in ("http", "https"):
             return False
-        host = host_of(place)
-        if host is None or not self.allows_host(place):
+        if not self.allows_host(place):
             return False
-        return place.lower() == netloc.lower() or host in self.names
-
-
-class Failures:
-    """Counts wrong tokens by address; memory is bounded."""
-
-    def __init__(self) -> None:
-        self._times: dict[str, deque[float]] = {}
-
-    def is_blocked(self, address: str, now_s: float) -> bool:
-        """Return whether an address has guessed too often."""
-        times = self._times.get(address)
-        while times and now_s - times[0] > FAILURES_S:
-            times.popleft()
-        return times is not None and len(times) >= FAILURES_MAX
-
-    def failed(self, address: str, now_s: float) -> None:
-        """Take a wrong token."""
-        if address not in self._times and len(self._times) >= ADDRESSES_MAX:
-            self._times.pop(next(iter(self._times)))
-        self._times.setdefault(address, deque(maxlen=FAILURES_MAX)).append(now_s)
+        return place.lower() == netloc.lower() or self._is_named(place)
 
 
 API = "/api/v1/"
@@ -256,11 +259,15 @@ class Guard:
     uploads: tuple[str, ...] = ()
     # What a refusal tells to do: the setting of the names, and the command that prints the link.
     names_by: str = "web.names"
-    printed_by: str = "vrspray run"
+    printed_by: str = "vrspray token show"
 
     def is_upload(self, path: str) -> bool:
         """Return whether the body of a POST is a file."""
         return path.startswith(self.uploads)
+
+    def keeps_place(self, asked: Asked, now_s: float) -> bool:
+        """Return whether nobody who comes later may push a request aside: a STOP, a session."""
+        return asked.path in _NO_ORIGIN or self.scope_of(asked, now_s) != "none"
 
     def scope_of(self, asked: Asked, now_s: float) -> Scope:
         """Return what a request may do, by its token or its session."""
@@ -275,7 +282,7 @@ class Guard:
         """Return status and text where a request is refused; None where it may go on."""
         hosts = [value for key, value in asked.headers if key == "host"]
         if len(hosts) != 1 or not self.doors.allows_host(hosts[0]):
-            return 421, f"this address does not belong to the page; add its name to {self.names_by}"
+            return 421, f"this address does not belong to the page; add it to {self.names_by}"
         if asked.method in ("GET", "HEAD"):
             is_open = not asked.path.startswith(API) or asked.path in _READ_OPEN
             needs: Scope = "none" if is_open else "view"
@@ -290,7 +297,7 @@ class Guard:
         if RANK[scope] >= RANK[needs]:
             return None
         if scope == "none":
-            return 401, f"open the link, or scan the QR code, that {self.printed_by} printed"
+            return 401, f"open the link, or scan the QR code, that {self.printed_by} prints"
         return 403, "this link may only look; an order needs the operator's link"
 
     def _foreign(self, asked: Asked, host: str) -> Refusal | None:

@@ -492,7 +492,8 @@ class OperatorPage:
         ):
             outcome = Outcome(accepted=False, text="late enable not taken: enable again")
         else:
-            self._taken_s.append(now_s)
+            if order.name != "stop":
+                self._taken_s.append(now_s)
             outcome = self._obey(order, now_s)
         self._reply(order, outcome)
         return outcome.inputs

@@ -21,7 +21,7 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -233,6 +233,24 @@ class Part:
     static: Path
     add: Callable[[APIRouter, Host], None]
     files_at: str | None = None
+
+
+async def on_ground(work: Coroutine[Any, Any, None], *, flying: Callable[[], str | None]) -> None:
+    """Do what takes long; a 409 ends it as soon as `flying` gives a reason."""
+    from fastapi import HTTPException
+
+    task = asyncio.create_task(work)
+    try:
+        done = False
+        while not done:
+            done = bool((await asyncio.wait((task,), timeout=LOOK_S))[0])
+            reason = flying()
+            if reason is not None:
+                raise HTTPException(409, reason)
+        task.result()
+    finally:
+        task.cancel()
+        await asyncio.wait((task,))
 
 
 @contextmanager

@@ -103,6 +103,8 @@ class Orders:
         self._connection = connection
         self._count = 0
         self._waiting: dict[int, asyncio.Future[Done]] = {}
+        # A STOP that is on its way, with no other order behind it.
+        self._stopping: asyncio.Future[Done] | None = None
 
     def attach(self, on_end: Callable[[], None]) -> None:
         """Begin to read answers; `on_end` is called when the companion has ended."""
@@ -111,21 +113,30 @@ class Orders:
     async def give(
         self, name: str, value: float | None = None, said: Mapping[str, object] | None = None
     ) -> Done:
-        """Pass an order on; a 503 where the companion does not answer."""
+        """Pass an order on; a 503 where the companion does not answer.
+
+        A STOP that is on its way is everybody's who stops meanwhile: a flood of them is one at a
+        time, and keeps no other order from the loop.
+        """
         self._count += 1
         number = self._count
         boot_s = time.clock_gettime(time.CLOCK_BOOTTIME)
         order = {"number": number, "name": name, "value": value, "boot_s": boot_s, "said": said}
-        waiting = asyncio.get_running_loop().create_future()
+        joined = self._stopping if name == "stop" else None
+        waiting = joined or asyncio.get_running_loop().create_future()
         self._waiting[number] = waiting
+        self._stopping = waiting if name == "stop" else None
         try:
-            self._connection.send(json.dumps(order).encode())
-            return await asyncio.wait_for(waiting, ANSWER_WITHIN_S)
+            if joined is None:
+                self._connection.send(json.dumps(order).encode())
+            return await asyncio.wait_for(asyncio.shield(waiting), ANSWER_WITHIN_S)
         except (OSError, TimeoutError) as error:
             text = "the companion does not answer: use the transmitter's switch"
             raise HTTPException(503, text) from error
         finally:
             del self._waiting[number]
+            if self._stopping is waiting:
+                self._stopping = None
 
     def _read(self, on_end: Callable[[], None]) -> None:
         packet = b""

@@ -21,7 +21,16 @@ from fastapi import APIRouter, HTTPException, Request, Response
 from fastapi.responses import FileResponse
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from companion.web.parts import Host, Limits, Outcome, Part, journal_to_read, or_refused, run_child
+from companion.web.parts import (
+    Host,
+    Limits,
+    Outcome,
+    Part,
+    journal_to_read,
+    on_ground,
+    or_refused,
+    run_child,
+)
 from missions.reading_fleet import NO_LINES
 
 FILE_BYTES_MAX, ALL_BYTES_MAX, FILES_MAX = 64_000_000, 256_000_000, 60
@@ -177,6 +186,8 @@ class Office:
     given: Path = field(init=False)
     made: Path = field(init=False)
     results: dict[str, Any] = field(default_factory=dict)
+    # Files that are arriving, with the bytes that each may still have.
+    arriving: dict[str, tuple[str, int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Name the folders; they are made when the first file comes."""
@@ -216,15 +227,20 @@ class Office:
         return Path(self.host.journals) / name
 
     async def receive(self, name: str, request: Request) -> None:
-        """Write a file as it comes, within the limits of the office."""
+        """Write a file as it comes, within the limits of the office, while all is on the ground."""
         self.refuse_now()
         if not _is_name(name) or Path(name).suffix.lower() not in SUFFIXES:
             raise HTTPException(422, f"{name[:80]}: not the name of a map; takes {_kinds()}")
         part = self.given.with_name(f"{os.urandom(8).hex()}.part")
+        told = request.headers.get("content-length", "")
         try:
             room = self._room(name)
+            if told.isdecimal() and int(told) <= room:
+                room = int(told)
+            # What comes meanwhile has the rest of the room.
+            self.arriving[part.name] = name, room
             async with asyncio.timeout(RECEIVE_WITHIN_S):
-                await _written(part, name, request, room)
+                await on_ground(_written(part, name, request, room), flying=self.host.flying)
             part.replace(self.given / name)
         except TimeoutError as error:
             raise HTTPException(408, f"{name}: arrived too slowly; try again") from error
@@ -232,6 +248,7 @@ class Office:
             reason = (error.strerror or "cannot be written").lower()
             raise HTTPException(413, f"{name}: not kept on this computer: {reason}") from error
         finally:
+            self.arriving.pop(part.name, None)
             with suppress(OSError):
                 part.unlink(missing_ok=True)
         self.results.clear()
@@ -240,9 +257,12 @@ class Office:
         """Return how many bytes a file may have; a 413 where there is no room for it."""
         self.given.mkdir(parents=True, exist_ok=True, mode=0o700)
         others = [path for path in self.given.iterdir() if path.name != name]
+        promised = sum(room for _, room in self.arriving.values())
         room = ALL_BYTES_MAX - sum(path.stat().st_size for path in others)
-        room = min(room, FILE_BYTES_MAX, shutil.disk_usage(self.given).free - FREE_MIN_BYTES)
-        if len(others) >= FILES_MAX or room <= 0:
+        room = min(room, shutil.disk_usage(self.given).free - FREE_MIN_BYTES) - promised
+        room = min(room, FILE_BYTES_MAX)
+        names = {path.name for path in others} | {each for each, _ in self.arriving.values()}
+        if len(names - {name}) >= FILES_MAX or room <= 0:
             raise HTTPException(413, "no room for more files: remove some")
         return room
 

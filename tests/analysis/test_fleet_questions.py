@@ -22,6 +22,7 @@ from analysis.fleet.store import Store
 from analysis.fleet.summary import FIGURES, GROUPS, summary_of
 from companion.cli.app import execute
 from companion.web.guard import Doors, Guard, Tokens
+from companion.web.places import Places
 from tests.analysis.fleet_flights import TOLD, copied, damaged, started
 from tests.analysis.report_flight import fly
 
@@ -346,7 +347,7 @@ def ask(app: Any, method: str, path: str, body: bytes = b"", **headers: str) -> 
 @pytest.fixture(scope="module")
 def app(fleet: Path) -> Any:
     guard = Guard(doors=Doors(is_local=False), tokens=TOKENS, printed_by="vrspray fleet serve")
-    return build_app(Store.at(str(fleet)), guard)
+    return build_app(Store.at(str(fleet)), guard, Places())
 
 
 @pytest.mark.parametrize("path", ["/api/v1/fleet", "/api/v1/files/fleet.json"])

@@ -361,6 +361,25 @@ async def test_an_order_of_the_page_is_forgotten_however_it_went(answered: bool)
         assert orders._waiting == {}
 
 
+async def test_stops_that_come_together_are_one_and_one_after_another_order_is_another() -> None:
+    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with near, far:
+        orders = Orders(near)
+        orders.attach(lambda: None)
+        names = ("stop", "stop", "enable", "stop", "stop")
+        given = [asyncio.ensure_future(orders.give(name)) for name in names]
+        await asyncio.sleep(0)
+        for name in ("stop", "enable", "stop"):
+            packet = json.loads(far.recv(4096))
+            assert packet["name"] == name
+            answer = {"number": packet["number"], "accepted": True, "text": name}
+            far.send(json.dumps(answer).encode())
+        assert [(await one).text for one in given] == list(names)
+        with pytest.raises(BlockingIOError):
+            far.recv(4096, socket.MSG_DONTWAIT)
+        asyncio.get_running_loop().remove_reader(near)
+
+
 @pytest.mark.parametrize("breaks", [True, False])
 async def test_a_browser_that_went_is_no_client_any_more(breaks: bool) -> None:
     class State:

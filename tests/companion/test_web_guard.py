@@ -10,19 +10,25 @@ from pathlib import Path
 
 import pytest
 import pytest_asyncio
+from fastapi import FastAPI
 
 from companion.errors import ConfigError
+from companion.web.entrance import Guarded, add_sessions
 from companion.web.guard import (
+    API,
     COOKIE,
     Doors,
+    Guard,
     Tokens,
     host_of,
     kept_tokens,
     new_tokens,
     session,
     session_scope,
+    since_start_s,
 )
-from tests.companion.web_site import OPERATE, VIEW, Site, served
+from companion.web.places import Places
+from tests.companion.web_site import OPERATE, VIEW, Site, ask, in_process, served
 
 IN_LOOP = pytest.mark.asyncio(loop_scope="module")
 
@@ -34,14 +40,14 @@ def bearer(token: str) -> dict[str, str]:
     return {"Authorization": f"Bearer {token}"}
 
 
-def cookie(scope: str, until_s: float = 9e9, tokens: Tokens = TOKENS) -> dict[str, str]:
+def cookie(scope: str, until_s: float = 1e9, tokens: Tokens = TOKENS) -> dict[str, str]:
     return {"Cookie": f"{COOKIE}={session(tokens, scope, int(until_s))}"}  # type: ignore[arg-type]
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
 async def page() -> AsyncIterator[Site]:
     """Yield a page as phones in the field call it: with a token. One for all: it starts slowly."""
-    async with served(is_local=False, names=["sprayer.example"]) as site:
+    async with served(is_local=False, names=["sprayer.example", "proxy.example:8443"]) as site:
         yield site
 
 
@@ -62,7 +68,8 @@ async def test_a_request_with_a_foreign_host_is_refused_whatever_it_asks(lan: Si
 
 @IN_LOOP
 async def test_hosts_that_are_ours_are_answered(lan: Site) -> None:
-    for host in ("127.0.0.1:1", "localhost", "[::1]:8", "10.1.2.3", "pi.local", "sprayer.example"):
+    names = ("sprayer.example", f"Sprayer.example:{lan.port}", "proxy.example:8443")
+    for host in ("127.0.0.1:1", "localhost", "[::1]:8", "10.1.2.3", "pi.local", *names):
         reply = await lan.asked("GET", "/api/v1/state", headers=bearer(VIEW), host=host)
         assert reply.status == 200, host
 
@@ -84,6 +91,21 @@ async def test_an_order_from_another_page_is_refused(lan: Site) -> None:
             reply = await lan.asked("POST", f"/api/v1/{name}", headers=headers)
             assert reply.status == 403, (origin, name)
     assert not lan.orders
+
+
+@IN_LOOP
+async def test_a_name_is_no_licence_for_what_its_other_ports_serve(lan: Site) -> None:
+    own = f"sprayer.example:{lan.port}"
+    for host in ("sprayer.example:81", "proxy.example", f"proxy.example:{lan.port}"):
+        assert (await lan.asked("GET", "/", host=host)).status == 421, host
+    for origin, status in (
+        ("http://sprayer.example:81", 403), ("http://proxy.example", 403),
+        ("http://sprayer.example", 200), (f"http://{own}", 200),
+        ("https://proxy.example:8443", 200),
+    ):  # fmt: skip
+        headers = {"Origin": origin, **bearer(OPERATE)}
+        reply = await lan.asked("POST", "/api/v1/disable", headers=headers, host=own)
+        assert reply.status == status, origin
 
 
 @IN_LOOP
@@ -114,11 +136,16 @@ async def test_wrong_tokens_and_cookies_open_nothing(lan: Site, wrong: str) -> N
 
 
 @IN_LOOP
-async def test_a_session_is_over_in_time_and_with_new_tokens(lan: Site) -> None:
-    over = cookie("operate", until_s=time.time() - 1)
+async def test_a_session_is_over_in_time_with_new_tokens_and_with_a_new_start(
+    lan: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    over = cookie("operate", until_s=since_start_s() - 1)
     other = cookie("operate", tokens=Tokens(view="w" * 43, operate=OPERATE))
     forged = {"Cookie": cookie("view")["Cookie"].replace("view", "operate")}
-    for headers in (over, other, forged):
+    monkeypatch.setattr("companion.web.guard._start", lambda: "another start of the computer")
+    before = cookie("operate")
+    monkeypatch.undo()
+    for headers in (over, other, forged, before):
         assert (await lan.asked("GET", "/api/v1/state", headers=headers)).status == 401
     assert (await lan.asked("GET", "/api/v1/state", headers=cookie("view"))).status == 200
 
@@ -143,14 +170,35 @@ async def test_a_token_opens_a_session_that_scripts_cannot_read(lan: Site) -> No
     assert (await lan.asked("POST", "/api/v1/disable", headers=headers)).json["accepted"]
 
 
-async def test_guessing_is_slowed_down_and_stop_is_not() -> None:
-    async with served(is_local=False) as site:
-        guess = ("POST", "/api/v1/session", {"token": "x"})
-        codes = [(await site.asked(*guess)).status for _ in range(12)]
-        assert codes == [401] * 10 + [429] * 2
-        right = await site.asked("POST", "/api/v1/session", {"token": OPERATE})
-        assert right.status == 429
-        assert (await site.asked("POST", "/api/v1/stop")).status == 200
+@IN_LOOP
+async def test_who_guesses_locks_nobody_out_who_has_the_same_address(lan: Site) -> None:
+    guess = ("POST", "/api/v1/session", {"token": "x"})
+    assert {(await lan.asked(*guess)).status for _ in range(30)} == {401}
+    right = await lan.asked("POST", "/api/v1/session", {"token": OPERATE})
+    assert right.json["scope"] == "operate"
+    assert (await lan.asked("POST", "/api/v1/stop")).status == 200
+
+
+@pytest.mark.parametrize("jump_s", [2e9, -2e9])
+async def test_a_clock_that_is_set_ends_no_session_and_lengthens_none(
+    monkeypatch: pytest.MonkeyPatch, jump_s: float
+) -> None:
+    guard = Guard(doors=Doors(is_local=False), tokens=TOKENS)
+    app = FastAPI()
+    add_sessions(app, guard, login_s=3600, is_tls=False)
+    places, session_at, now_s = Places(), f"{API}session", time.time()
+    async with in_process(Guarded(app, guard, places), places) as port:
+        opened = await asyncio.to_thread(ask, port, "POST", session_at, {"token": OPERATE})
+        mine = {"Cookie": opened.headers["set-cookie"].partition(";")[0]}
+
+        async def scope() -> object:
+            reply = await asyncio.to_thread(ask, port, "GET", session_at, headers=mine)
+            return reply.json["scope"]
+
+        monkeypatch.setattr(time, "time", lambda: now_s + jump_s)
+        assert await scope() == "operate"
+        monkeypatch.setattr("companion.web.entrance.since_start_s", lambda: since_start_s() + 3601)
+        assert await scope() == "none"
 
 
 @IN_LOOP

@@ -16,7 +16,8 @@ from pathlib import Path
 import pytest
 import pytest_asyncio
 
-from companion.core.types import Inhibit, SprayerState
+from companion.core.controller import Memory, step
+from companion.core.types import Decision, Inhibit, SprayerState
 from companion.errors import ConfigError
 from companion.link.component import Component, ComponentOptions
 from companion.web import OperatorPage, Order, Outcome, listen
@@ -42,6 +43,7 @@ from companion.web.page import (
     parse_order,
 )
 from companion.web.parts import Limits, run_child
+from tests import builders
 from tests.companion.web_site import SETUP, Site, about, aged, served, until
 
 IN_LOOP = pytest.mark.asyncio(loop_scope="module")  # one page for all: it starts slowly
@@ -493,9 +495,15 @@ async def test_a_flood_of_orders_costs_a_few_a_step_and_stop_passes(loop: Loop) 
     for step_number in range(15):
         loop.page.read(1.0 + 0.01 * step_number)
     assert len(loop.obeyed) == 20
-    loop.put("stop")
-    loop.page.read(1.2)
-    assert loop.obeyed[-1].name == "stop"
+    for _ in range(30):
+        loop.put("stop")
+    for step_number in range(15):
+        loop.page.read(1.9 + 0.01 * step_number)
+    assert [order.name for order in loop.obeyed[20:]] == ["stop"] * 30
+    # And stops keep no other order away.
+    loop.put("disable")
+    loop.page.read(2.2)
+    assert loop.obeyed[-1].name == "disable"
     loop.browser.send(b"x" * 4 * ORDER_BYTES_MAX)
     assert list(loop.page.read(1.3)) == []
 
@@ -544,6 +552,37 @@ def test_the_pages_stop_is_the_commands_stop_and_is_told_to_the_ground_station()
     assert any(b"emergency stop" in frame for frame in wire.sent)
     (wish,) = wire.component.obey_page("disable", None, 6.0).inputs
     assert (wish.enable, wish.source) == (False, "web")  # type: ignore[union-attr]
+
+
+def test_stops_are_a_row_a_change_and_repeated_ones_are_counted() -> None:
+    component = Wire(page_may_enable=True).component
+    events: list[str] = []
+    component.on_event = lambda _at_s, _kind, text: events.append(text)
+    decision, state = stopped(5.1), builders.flying(5.1, 6.0)
+
+    def stop(times: int) -> list[object]:
+        found = []
+        for _ in range(times):
+            found += component.obey_page("stop", None, 5.0).inputs
+            component.tick(decision, 5.1)
+        return found
+
+    assert len(stop(174)) == 1
+    assert events == ["emergency stop", *(f"emergency stop, {n} times" for n in (10, 100))]
+    component.obey_page("disable", None, 6.0)
+    assert events.pop() == "emergency stop, 174 times"
+    # The next is news again, and so is one that the core knows nothing of.
+    assert len(stop(3)) == 1
+    for unknown in (None, step(SETUP, state, Memory(), 5.1)[0]):
+        component.tick(unknown, 7.0)
+        assert len(stop(1)) == 1
+    assert events[3:] == ["emergency stop"] * 3
+
+
+def stopped(now_s: float) -> Decision:
+    """Return a decision of a sprayer that was stopped."""
+    decision, _ = step(SETUP, builders.flying(now_s, 6.0, estop=True), Memory(), now_s)
+    return decision
 
 
 def test_the_page_enables_only_where_the_configuration_lets_it() -> None:

@@ -16,6 +16,8 @@ from typing import Any
 from companion.core.controller import Memory, step
 from companion.core.types import Decision, VehicleState
 from companion.web import OperatorPage, Order, Outcome, listen, map_object
+from companion.web.entrance import Guarded, server_of
+from companion.web.places import Places
 from tests import builders
 
 VIEW, OPERATE = "v" * 43, "o" * 43
@@ -57,34 +59,8 @@ class Site:
         self.page.show(decision)
         return decision
 
-    def ask(
-        self,
-        method: str,
-        path: str,
-        body: object = None,
-        headers: dict[str, str] | None = None,
-        *,
-        host: str | None = None,
-    ) -> Reply:
-        """Ask over a new connection; a POST comes from the page itself, unless told otherwise."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=250.0)
-        given = {"Host": f"127.0.0.1:{self.port}" if host is None else host}
-        data = None
-        if method == "POST":
-            given |= {"Origin": f"http://127.0.0.1:{self.port}", "Content-Type": "application/json"}
-            data = body if isinstance(body, bytes) else json.dumps(body or {}).encode()
-        given |= headers or {}
-        with contextlib.closing(connection):
-            connection.putrequest(method, path, skip_host=True, skip_accept_encoding=True)
-            if data is not None and "Content-Length" not in given:
-                given["Content-Length"] = str(len(data))
-            for name, value in given.items():
-                if value:
-                    connection.putheader(name, value)
-            connection.endheaders(data)
-            reply = connection.getresponse()
-            found = {name.lower(): value for name, value in reply.getheaders()}
-            return Reply(reply.status, found, reply.read())
+    def ask(self, *arguments: Any, **options: Any) -> Reply:
+        return ask(self.port, *arguments, **options)
 
     async def asked(self, *arguments: Any, **options: Any) -> Reply:
         return await asyncio.to_thread(self.ask, *arguments, **options)
@@ -159,6 +135,54 @@ async def served(folder: Path | None = None, **change: object) -> AsyncIterator[
         await asyncio.gather(turning, return_exceptions=True)
         await page.close()
         executor.shutdown()
+
+
+@contextlib.asynccontextmanager
+async def in_process(app: Guarded, places: Places) -> AsyncIterator[int]:
+    """Serve an application in this process, whose limits and clocks a test may change."""
+    executor = ThreadPoolExecutor(1)
+    asyncio.get_running_loop().set_default_executor(executor)
+    await asyncio.to_thread(time.monotonic)
+    with listen("127.0.0.1", 0) as listener:
+        port = listener.getsockname()[1]
+        server = server_of(app, tls=None, shutdown_within_s=1)
+        serving = asyncio.create_task(server.serve(sockets=[places.listening(listener)]))
+        try:
+            yield port
+        finally:
+            server.should_exit = True
+            await serving
+            executor.shutdown()
+
+
+def ask(
+    port: int,
+    method: str,
+    path: str,
+    body: object = None,
+    headers: dict[str, str] | None = None,
+    *,
+    host: str | None = None,
+) -> Reply:
+    """Ask over a new connection; a POST comes from the page itself, unless told otherwise."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=250.0)
+    given = {"Host": f"127.0.0.1:{port}" if host is None else host}
+    data = None
+    if method == "POST":
+        given |= {"Origin": f"http://127.0.0.1:{port}", "Content-Type": "application/json"}
+        data = body if isinstance(body, bytes) else json.dumps(body or {}).encode()
+    given |= headers or {}
+    with contextlib.closing(connection):
+        connection.putrequest(method, path, skip_host=True, skip_accept_encoding=True)
+        if data is not None and "Content-Length" not in given:
+            given["Content-Length"] = str(len(data))
+        for name, value in given.items():
+            if value:
+                connection.putheader(name, value)
+        connection.endheaders(data)
+        reply = connection.getresponse()
+        found = {name.lower(): value for name, value in reply.getheaders()}
+        return Reply(reply.status, found, reply.read())
 
 
 def aged(order: Order, seconds: float) -> Order:

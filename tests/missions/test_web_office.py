@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ BYTES = {"Content-Type": "application/octet-stream"}
 pytestmark = pytest.mark.timeout(300)
 IN_LOOP = pytest.mark.asyncio(loop_scope="module")
 OFFICE = "/api/v1/office"
+FOLDERS: dict[int, Path] = {}
 SQUARE = {
     "type": "Polygon",
     "coordinates": [[[8.0, 47.0], [8.001, 47.0], [8.001, 47.0004], [8.0, 47.0004], [8.0, 47.0]]],
@@ -38,6 +39,7 @@ async def site(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Site]:
     host = {"folder": str(folder), "config": CONFIG, "upload_link": "", "journals": ""}
     async with served(host=host) as found:
         await on_ground(found)
+        FOLDERS[found.port] = folder
         yield found
 
 
@@ -295,6 +297,8 @@ def office(folder: Path, flying: Any = lambda: None) -> Office:
 
 class Large:
     """A request that never ends."""
+
+    headers: Mapping[str, str] = {}
 
     async def stream(self) -> AsyncIterator[bytes]:
         while True:

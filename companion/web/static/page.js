@@ -99,7 +99,7 @@ async function begin() {
     : scope === "none" ? "" : scope === "operate" ? "Logged in to operate." : "Logged in to look, and to stop.";
   if (scope === "none") {
     byId("state-word").textContent = "LOG IN";
-    byId("state-line").textContent = "Open the link, or scan the QR code, that vrspray run printed. STOP works without.";
+    byId("state-line").textContent = "Open the link, or scan the QR code, that vrspray token show prints. STOP works without.";
     addEventListener("hashchange", () => location.reload());
     return;
   }
