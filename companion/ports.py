@@ -19,6 +19,10 @@ class PlanExecutor(Protocol):
     def fault(self) -> str | None:
         """Why the outputs cannot be trusted, in a few words, latched; None while all is well."""
 
+    @property
+    def is_guarded(self) -> bool:
+        """Whether something beside this computer closes when it fails, where that is asked for."""
+
     async def start(self) -> None:
         """Take the outputs and order all of them closed."""
 

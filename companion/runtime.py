@@ -134,7 +134,7 @@ class ControlLoop:
         self._memory = Memory()
         self._sensors = sensors
         self._told: frozenset[Finding] = frozenset()
-        self._reported: tuple[str | None, str | None] | None = None
+        self._reported: tuple[str | None, str | None, bool] | None = None
         self._stepped_s = float("-inf")
         self._coverage_s = float("-inf")
 
@@ -250,9 +250,10 @@ class ControlLoop:
     def _output_report(self) -> Iterator[Input]:
         """Yield what changed in the way to the valves: the link to the vehicle, or the outputs."""
         faults = (self._executor.fault or self._missing_record(), self._link.fault)
-        if self._reported == faults:
+        is_guarded = self._executor.is_guarded
+        if self._reported == (*faults, is_guarded):
             return
-        first, self._reported = self._reported is None, faults
+        first, self._reported = self._reported is None, (*faults, is_guarded)
         fault = faults[0] or faults[1]
         now_s = self._clock()
         if fault is not None:
@@ -264,6 +265,7 @@ class ControlLoop:
             received_s=now_s,
             healthy=faults[0] is None,
             link_up=faults[1] is None,
+            guarded=is_guarded,
             text=fault or "",
         )
 

@@ -125,6 +125,9 @@ def serve(
     ground: Annotated[
         bool, typer.Option("--ground", help="Stay on the ground, disarmed, for ground work.")
     ] = False,
+    no_script: Annotated[
+        bool, typer.Option("--no-script", help="ArduPilot without its watchdog script.")
+    ] = False,
     json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
 ) -> None:
     """Serve a simulated autopilot for `vrspray run` to connect to.
@@ -158,6 +161,7 @@ def serve(
         out=out,
         sensors=sensors,
         enable=not no_enable,
+        script=not no_script,
         ground=ground,
         wait_s=wait_s,
     )

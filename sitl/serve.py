@@ -55,6 +55,7 @@ from sitl.stub.px4 import px4_parameters
 from sitl.stub.scenario import Scenario, load_scenario
 from sitl.stub.server import StubOptions, StubServer, TruthLog, build_autopilot, firmware_of
 from sitl.stub.sprayer import TAKE_OFF, BoardKind, LiquidOptions, Sprayer, SprayerOptions, words_of
+from sitl.stub.watchdog import Watched
 from sitl.vehicle import Corners
 
 # The friendly operator: waits for mission and companion, flies, enables spraying, lands.
@@ -243,6 +244,7 @@ class ServeOptions:
     sensors: Path | None = None
     enable: bool = True
     ground: bool = False
+    script: bool = True
     wait_s: float | None = None
 
 
@@ -297,6 +299,7 @@ class _Run:
                 scenario=scenario,
                 signing_time=round((time.time() - _EPOCH_2015_S) * 1e5),
                 seed=options.seed,
+                watched=_watched(config) if options.script else None,
                 believed=None if motions is None else Told(motions[1]),
             ),
             start_s=start_s,
@@ -521,6 +524,17 @@ def _liquid(options: ServeOptions, scenario: Scenario) -> LiquidOptions | None:
         pressure_folder=options.sensors,
     )
     return None if found == LiquidOptions() else found
+
+
+def _watched(config: Config) -> Watched:
+    """Return what the watchdog script of the stub guards: all that the configuration wires."""
+    valves = (valve.channel for valve in config.boom().valves)
+    return Watched(
+        channels=[channel for channel in (*valves, *_drive_channels(config)) if channel],
+        closed_us=config.output.closed_us,
+        return_channel=config.output.return_channel or 0,
+        return_us=config.output.full_us,
+    )
 
 
 def sprayer_options(options: ServeOptions, config: Config, scenario: Scenario) -> SprayerOptions:

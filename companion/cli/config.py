@@ -98,7 +98,9 @@ def new(
     link: Annotated[
         str, typer.Option(metavar="URL", help="Link to the flight controller.")
     ] = "serial:/dev/serial0:921600",
-    output: Annotated[str, typer.Option(metavar="KIND", help="servo or gpio.")] = "servo",
+    output: Annotated[
+        str, typer.Option(metavar="KIND", help="servo or gpio; see question 2.")
+    ] = "servo",
     valves: Annotated[int, typer.Option(metavar="N", help="Number of valves.")] = 6,
     spacing_m: Annotated[float, typer.Option(metavar="M", help="Between valves.")] = 1.0,
     nozzle: Annotated[

@@ -461,6 +461,8 @@ def _watchdog(heard: Heard, options: ServoOptions) -> Check:
     if trouble is None:
         return ok(name, "runs and guards these outputs")
     text, fix = trouble
+    if not options.needs_guard:
+        return warn(name, f"{text} (output.guard)", fix)
     # A board closes valves only: orders to motors are not dithered.
     if options.dither_us and not options.drives:
         return warn(name, f"{text}: only the driver board's alive dither closes the valves", fix)
@@ -471,7 +473,7 @@ def _board_alone(name: str, options: ServoOptions) -> Check:
     """Check what PX4 leaves, which has no script: a board closes valves, and no motor."""
     if not options.dither_us:
         text = "if the companion fails, PX4 keeps its last order until disarmed"
-        return fail(name, text, _BOARD)
+        return (fail if options.needs_guard else warn)(name, text, _BOARD)
     if options.drives:
         text = f"only disarming stops the motor at output {options.drives[0].channel}"
         return warn(name, f"PX4 has none: {text}", _RELAY)

@@ -24,6 +24,12 @@ from companion.errors import ConfigError, MapError, Problem, VrsprayError
 Ask = Callable[[str, str], str]
 AUTOPILOTS = ("ardupilot", "px4")
 OUTPUTS = ("servo", "gpio")
+GUARDS = ("script", "board", "none")
+_GUARD_LINES = {
+    "script": "",
+    "board": "# The driver board closes when its signal stops moving.\ndither_us = 8\n",
+    "none": '# Loss of power leaves the valves as they are.\nguard = "none-on-power-loss"\n',
+}
 UNITS = ("L/ha", "gal/ac", "mL/m2", "L/mu")
 VALVES_MAX = 64
 _FROM_PROFILE = """\
@@ -46,6 +52,7 @@ class Answers:
     link: str = "serial:/dev/serial0:921600"
     output: Literal["servo", "gpio"] = "servo"
     first_channel: int = 9
+    guard: str = "script"
     valves: int = 6
     spacing_m: float = 1.0
     nozzle_l_min: float = 0.8
@@ -81,8 +88,9 @@ def ask_all(answers: Answers, ask: Ask, complain: Callable[[str], None]) -> Answ
         "1. Autopilot and its link", f"{was.autopilot} {was.link}", _with_autopilot, answers
     )
     answers = asked(
-        "2. Valves on: servo or gpio, and the first output",
-        f"{answers.output} {answers.first_channel}",
+        "2. Valves on: servo or gpio, the first output, and of servo what closes them when this "
+        "computer loses power: script (ArduPilot's watchdog), board (sees alive dither), or none",
+        " ".join(_outputs(answers)),
         _with_outputs,
         answers,
     )
@@ -174,17 +182,29 @@ def _with_autopilot(answers: Answers, text: str) -> Answers:
         autopilot="px4" if is_px4 else "ardupilot",
         link=link,
         first_channel=1 if is_px4 else 9,
+        guard="board" if is_px4 else "script",
     )
 
 
 def _with_outputs(answers: Answers, text: str) -> Answers:
     words = text.split()
     kind, *rest = words or [""]
+    is_px4 = answers.autopilot == "px4"
+    guards = ("board", "none") if is_px4 else GUARDS
+    guard = rest.pop() if rest and rest[-1] in GUARDS else guards[0]
     if kind not in OUTPUTS or len(rest) > 1:
         raise ConfigError(f"{' '.join(words)!r}: not an output; write servo 9, or gpio 5")
-    default = 5 if kind == "gpio" else 1 if answers.autopilot == "px4" else 9
+    if guard not in guards:
+        raise ConfigError(f"{guard}: PX4 has no watchdog script; write board, or none")
+    default = 5 if kind == "gpio" else 1 if is_px4 else 9
     first = int(_number(rest[0], "first output", 0, 1023)) if rest else default
-    return replace(answers, output="gpio" if kind == "gpio" else "servo", first_channel=first)
+    output: Literal["servo", "gpio"] = "gpio" if kind == "gpio" else "servo"
+    return replace(answers, output=output, first_channel=first, guard=guard)
+
+
+def _outputs(answers: Answers) -> list[str]:
+    words = [answers.output, str(answers.first_channel)]
+    return [*words, answers.guard] if answers.output == "servo" else words
 
 
 def _with_valves(answers: Answers, text: str) -> Answers:
@@ -364,14 +384,15 @@ def _output(answers: Answers) -> str:
 kind = "gpio"
 chip = "gpiochip0"
 """
-    return """
+    return f"""
 # Valves on outputs of the flight controller: pulse of closed and of fully open, as the driver
-# board takes them.
+# board takes them. Nothing is sprayed unless ArduPilot's watchdog script is seen, or a driver board
+# closes when its signal stops moving (dither_us).
 [output]
 kind = "servo"
 closed_us = 1000
 full_us = 2000
-"""
+{_GUARD_LINES[answers.guard]}"""
 
 
 def _safety(answers: Answers) -> str:

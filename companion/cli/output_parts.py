@@ -246,6 +246,7 @@ def servo_options(config: Config) -> ServoOptions | None:
         dither_us=output.dither_us,
         return_channel=output.return_channel if has_valves else None,
         drives=drives,
+        needs_guard=output.guard == "auto" and output.kind == "servo",
     )
 
 

@@ -230,6 +230,12 @@ def remarks(config: Document) -> Rule:
             text="not set: there is no map yet; `vrspray run` refuses to start until one is named",
         )
     yield from unbounded(config)
+    if config.output.kind == "servo" and config.output.guard != "auto":
+        yield Contradiction(
+            key="output.guard",
+            text="nothing closes the valves when this computer loses power; keep a hand at the "
+            "pump switch",
+        )
     if config.flow_meter.source == "none" and config.lag.measured_on is None:
         yield Contradiction(
             key="flow_meter.source",

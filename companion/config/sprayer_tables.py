@@ -221,6 +221,11 @@ class OutputTable(Table):
         le=50,
         description="alive dither of open valves, for a driver board that closes without it: 8",
     )
+    guard: Literal["auto", "none-on-power-loss"] = Field(
+        default="auto",
+        description="what closes servo outputs when the whole computer fails; auto: the watchdog "
+        "script, or a driver board by dither_us, else nothing is sprayed",
+    )
     lease_s: float = Field(
         default=0.3,
         ge=0.1,

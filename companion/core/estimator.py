@@ -441,8 +441,7 @@ def _stand(track: Track, item: Telemetry) -> LastPlace:
 
 def estimate(track: Track, now_s: float) -> VehicleState | None:
     """Return the vehicle's state at `now_s`; None before the first position."""
-    motion = track.motion
-    if motion is None:
+    if (motion := track.motion) is None:
         return None
     dt_s = now_s - motion.time_s
     nose_deg, (turned_deg, yaw) = motion.heading_deg, motion.yaw.ending.after(dt_s)
@@ -487,6 +486,7 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         rc_switch_on=track.consent.switch_on(now_s),
         output_healthy=track.output is None or track.output.healthy,
         link_up=track.output is None or track.output.link_up,
+        output_guarded=track.output is None or track.output.guarded,
         enabled=track.consent.enabled,
         operator_wishes=track.consent.wishes,
         estop=track.consent.is_stopped,

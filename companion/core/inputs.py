@@ -175,6 +175,7 @@ class OutputReport:
     healthy: bool
     text: str = ""
     link_up: bool = True
+    guarded: bool = True  # something closes when this computer fails, or need not
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

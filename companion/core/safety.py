@@ -179,6 +179,8 @@ def _vehicle(state: VehicleState, limits: Limits, now_s: float) -> list[Inhibit]
         found.append(Inhibit.OUTPUT_FAULT)
     if not state.link_up:
         found.append(Inhibit.LINK_LOST)
+    if state.output_guarded is not True:
+        found.append(Inhibit.UNGUARDED)
     return found
 
 

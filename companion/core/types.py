@@ -314,6 +314,7 @@ class Inhibit(StrEnum):
     RC_SWITCH = "rc-switch"
     OUTPUT_FAULT = "output-fault"
     LINK_LOST = "link-lost"
+    UNGUARDED = "unguarded"  # nothing would close when this computer fails
     LEAK = "leak"
     VALVE_STUCK_OPEN = "valve-stuck-open"
     NO_FLOW = "no-flow"
@@ -361,6 +362,7 @@ _WORDS = {
     Inhibit.LABEL_INVERSION: "inversion not ruled out",
     Inhibit.LABEL_DROPLETS: "droplets outside label",
     Inhibit.RC_SWITCH: "RC switch off",
+    Inhibit.UNGUARDED: "no watchdog script or board",
 }
 
 
@@ -467,6 +469,7 @@ class VehicleState:
     wind: WindReport | None = None  # where its direction is known
     rate_percent: float = 100.0
     wind_received_s: float | None = None
+    output_guarded: bool = True
     position_frozen: bool = False  # the place stands still, the vehicle does not
     rc_switch_on: bool | None = None  # None: no switch, or nothing young is known of it
     acceleration_fade_s: float = 0.5  # the acceleration's time constant in every prediction

@@ -228,8 +228,8 @@ class Announcer:
 def lines(text: str) -> list[str]:
     """Return `text` in lines that a station shows whole; what does not fit two is counted.
 
-    >>> lines("no watchdog on autopilot: valves stay open if companion stops")
-    ['Spray: no watchdog on autopilot: valves stay open', 'Spray: if companion stops']
+    >>> lines("no watchdog on autopilot: valves stay open without power")
+    ['Spray: no watchdog on autopilot: valves stay open', 'Spray: without power']
     """
     room = _LINE_MAX - len(_PREFIX)
     words, found = text.split(" "), [""]

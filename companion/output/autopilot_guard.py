@@ -107,12 +107,14 @@ def findings(options: ServoOptions, known: Known, *, is_px4: bool) -> list[Findi
 def dead_man(options: ServoOptions, known: Known, *, is_px4: bool) -> Finding | None:
     """Return what is missing for the valves to close when this computer dies.
 
-    Either a script on ArduPilot, or a board that wants its widths to move; PX4 has only the board.
+    Either a script on ArduPilot, or a board that wants its widths to move; PX4 has only the board,
+    and a board stops no motor.
     """
-    if options.dither_us or (not is_px4 and known.get(_WATCHDOG) == 1.0):
+    has_board = options.dither_us > 0 and bool(options.channels)
+    if has_board or (not is_px4 and known.get(_WATCHDOG) == 1.0):
         return None
     what = "output.dither_us is 0" if is_px4 else "no watchdog on autopilot"
-    return _warning(f"WARNING {what}: valves stay open if companion stops")
+    return _warning(f"WARNING {what}: valves stay open without power")
 
 
 def _merged(found: Sequence[Finding]) -> Iterator[Finding]:
@@ -289,6 +291,12 @@ class OutputGuard:
         return self._wiring or self._finding or self._refused or self._stray.text
 
     @property
+    def is_guarded(self) -> bool:
+        """Return whether something beside the companion closes, where that is asked for."""
+        missing = dead_man(self._options, self._known, is_px4=self._is_px4)
+        return missing is None or not self._options.needs_guard
+
+    @property
     def is_refused(self) -> bool:
         """Return whether the autopilot refuses orders; each more costs a text on a screen."""
         return self._refused is not None
@@ -320,7 +328,8 @@ class OutputGuard:
         self._finding = faults[0] if faults else None
         for text in [*faults[1:], *(finding.text for finding in found if not finding.is_fault)]:
             self._tell(text)
-        return ()
+        # The script may have answered too late, or start later than we.
+        return () if self.is_guarded or self._is_px4 else (_WATCHDOG,)
 
     def acknowledge(self, result: int) -> None:
         """Take the answer to an order. It does not say to which one."""

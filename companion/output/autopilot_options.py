@@ -41,6 +41,8 @@ class ServoOptions:
 
     Drives have ends of their own; without valves they are all there is.
 
+    With `needs_guard` nothing opens unless something beside the companion closes.
+
     At `return_channel`, if there is one, `full_us` opens a return valve and `closed_us` shuts it.
     With `dither_us` the pulse of an open valve moves to and fro by that much, around its own width,
     every `DITHER_S`: a board that wants to see it closes when the autopilot goes on with a pulse
@@ -56,6 +58,7 @@ class ServoOptions:
     dithers_together: bool = False
     return_channel: int | None = None
     drives: tuple[DriveOutput, ...] = ()
+    needs_guard: bool = False
 
     def __post_init__(self) -> None:
         if not self.outputs or len(set(self.outputs)) != len(self.outputs):

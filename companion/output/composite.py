@@ -54,6 +54,11 @@ class CompositeExecutor:
         faults = (executor.fault for executor in self.executors)
         return next((fault for fault in faults if fault is not None), None)
 
+    @property
+    def is_guarded(self) -> bool:
+        """Whether something closes all of them when this computer fails."""
+        return all(executor.is_guarded for executor in self.executors)
+
     async def start(self) -> None:
         """Take all outputs; where one cannot be had, the others are let go again."""
         for number, executor in enumerate(self.executors):

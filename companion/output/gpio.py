@@ -101,6 +101,11 @@ class GpioExecutor:
         return self._fault
 
     @property
+    def is_guarded(self) -> bool:
+        """Whether something closes when this computer fails: its lines then carry nothing."""
+        return True
+
+    @property
     def lease_end_count(self) -> int:
         """Return how often the engine closed because no plan came."""
         return self.status.lease_ends

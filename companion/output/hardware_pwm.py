@@ -53,6 +53,11 @@ class HardwarePwmExecutor(TimedExecutor):
         """Why the outputs cannot be trusted; it stays."""
         return self._fault
 
+    @property
+    def is_guarded(self) -> bool:
+        """Whether something stops them when this computer fails: its pins then carry nothing."""
+        return True
+
     async def start(self) -> None:
         """Take the outputs and have all of them pulse at stop.
 

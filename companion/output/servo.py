@@ -89,6 +89,11 @@ class ServoExecutor(TimedExecutor):
         """Why the outputs cannot be trusted; None while they take orders and follow them."""
         return self._guard.fault
 
+    @property
+    def is_guarded(self) -> bool:
+        """Whether something closes when this computer fails, where that is asked for."""
+        return self._guard.is_guarded
+
     # ------------------------------------------------------------- what the autopilot says
 
     def met(self, is_px4: bool) -> Sequence[str]:

@@ -96,6 +96,11 @@ class TimedExecutor:
         return None
 
     @property
+    def is_guarded(self) -> bool:
+        """Whether something closes when this computer fails."""
+        return True
+
+    @property
     def valve_count(self) -> int:
         """Return how many valves it has; 0 where it only drives motors."""
         return self._count

@@ -72,6 +72,7 @@ ADVICE: dict[Inhibit, str] = {
     Inhibit.RC_SWITCH: "Turn the spray switch on the transmitter on.",
     Inhibit.OUTPUT_FAULT: "Do not spray. Land, then run vrspray doctor.",
     Inhibit.LINK_LOST: "Check the link to the autopilot.",
+    Inhibit.UNGUARDED: "Install the watchdog script, or fit a board: docs/safety.md.",
     Inhibit.LEAK: "Liquid flows with all valves closed: land and look for the leak.",
     Inhibit.VALVE_STUCK_OPEN: "Land and check the valve.",
     Inhibit.NO_FLOW: "Check pump, tank and hoses.",

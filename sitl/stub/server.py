@@ -25,11 +25,12 @@ from sitl.stub.firmware import Firmware, Parts
 from sitl.stub.flight import Flight
 from sitl.stub.mission_items import MissionItem
 from sitl.stub.outputs import ActuatorOutputs, Outputs, ServoOrder, ServoOutputs
-from sitl.stub.parameters import Parameters
+from sitl.stub.parameters import Parameters, ardupilot_table
 from sitl.stub.protocol import Channel, SigningKey
 from sitl.stub.px4 import COMMANDS_PER_S, nan_keeps, px4, px4_parameters
 from sitl.stub.scenario import Scenario
 from sitl.stub.sprayer import Sprayer
+from sitl.stub.watchdog import Watchdog, Watched
 from sitl.stub.world import ARDUPILOT_NOISE, PX4_NOISE, Estimator, EstimatorNoise, Pose, World
 from sitl.vehicle import Corners
 
@@ -44,7 +45,8 @@ class StubOptions:
 
     `faults` come on top of those of the scenario; `noise` takes the place of the firmware's and
     of the scenario's, `believed` that of the estimate that they would make. `signing_time` is the
-    time stamp that a signed link begins with.
+    time stamp that a signed link begins with. ArduPilot's watchdog script runs where it is told
+    what is `watched`.
     """
 
     home: Earth
@@ -61,6 +63,7 @@ class StubOptions:
     signing_time: int = 0
     seed: int = 0
     believed: Estimator | None = None
+    watched: Watched | None = None
 
 
 def build_autopilot(
@@ -86,7 +89,7 @@ def build_autopilot(
     )
     flight.set_items(options.items, start_s)
     faults = FaultClock((*scenario.faults, *options.faults), start_s=start_s)
-    return Autopilot(
+    autopilot = Autopilot(
         Parts(
             firmware=firmware,
             flight=flight,
@@ -102,6 +105,9 @@ def build_autopilot(
         ),
         start_s=start_s,
     )
+    if options.watched is not None and options.autopilot == "ardupilot":
+        autopilot.script = Watchdog(options.watched, autopilot)
+    return autopilot
 
 
 def firmware_of(autopilot: str, scenario: Scenario) -> Firmware:
@@ -125,7 +131,9 @@ def firmware_of(autopilot: str, scenario: Scenario) -> Firmware:
 
 def parameters_of(options: StubOptions, scenario: Scenario) -> Parameters:
     """Return the firmware's parameters as the scenario sets them."""
-    parameters = px4_parameters() if options.autopilot == "px4" else Parameters()
+    is_px4, watched = options.autopilot == "px4", options.watched
+    script = {} if watched is None else watched.table()
+    parameters = px4_parameters() if is_px4 else Parameters({**ardupilot_table(), **script})
     parameters.put_speed("cruise", options.speed_m_s)
     for name, value in scenario.parameters.items():
         if name not in parameters:

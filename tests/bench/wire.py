@@ -41,7 +41,10 @@ def example(folder: Path, *, autopilot: str, port: int, dither_us: int = 0) -> P
     for old, new in (_PX4 if autopilot == "px4" else {}).items():
         assert text.count(old) == 1, old
         text = text.replace(old, new)
-    text = text.replace('kind = "servo"\n', f'kind = "servo"\ndither_us = {dither_us}\n')
+    # The stub's PX4 has no board that closes; its ArduPilot runs the script.
+    guard = "none-on-power-loss" if autopilot == "px4" and not dither_us else "auto"
+    output = f'kind = "servo"\ndither_us = {dither_us}\nguard = "{guard}"\n'
+    text = text.replace('kind = "servo"\n', output)
     config.write_text(text, encoding="utf-8")
     return config
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import math
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.output.autopilot_guard import dead_man, findings, wanted_parameters
-from companion.output.autopilot_options import OutputCheck, ardupilot_places
+from companion.output.autopilot_options import DriveOutput, OutputCheck, ardupilot_places
 from companion.output.servo import (
     OrderBudget,
     ServoExecutor,
@@ -364,6 +365,34 @@ def test_that_nothing_closes_for_a_dead_computer_is_said(value: float | None) ->
     assert "SPRW_ENABLE" in wanted_parameters(OPTIONS, is_px4=False)
     assert dead_man(OPTIONS, {"SPRW_ENABLE": 1.0}, is_px4=False) is None
     assert dead_man(OPTIONS, {"SPRW_ENABLE": 1.0}, is_px4=True) is not None
+
+
+async def test_outputs_are_guarded_by_the_script_or_by_a_board() -> None:
+    wired = {"SERVO9_FUNCTION": 0.0, "SERVO10_FUNCTION": 0.0}
+
+    def made(**options: Any) -> ServoExecutor:
+        given = ServoOptions(**{"channels": (9, 10), "needs_guard": True, **options})
+        return ServoExecutor(given, lambda channel, pulse_us: True)
+
+    executor = made()
+    assert not executor.is_guarded  # nobody was met
+    executor.met(is_px4=False)
+    # Asked for again and again: the script may start later.
+    assert executor.learned({**wired, "SPRW_ENABLE": None}) == ("SPRW_ENABLE",)
+    assert not executor.is_guarded
+    for value, is_guarded in ((0.0, False), (math.nan, False), (1.0, True)):
+        executor.learned({"SPRW_ENABLE": value})
+        assert executor.is_guarded is is_guarded
+    assert executor.fault is None
+    executor.met(is_px4=False)  # another start of the autopilot: it may run no more
+    assert not executor.is_guarded
+    executor.met(is_px4=True)
+    executor.learned({"SPRW_ENABLE": 1.0})
+    assert not executor.is_guarded
+    assert made(dither_us=8).is_guarded
+    assert made(needs_guard=False).is_guarded
+    # A board stops no motor, and here nothing else keeps the liquid.
+    assert not made(channels=(), drives=(DriveOutput(channel=5),), dither_us=8).is_guarded
 
 
 def test_a_mask_that_is_no_number_has_no_bit() -> None:

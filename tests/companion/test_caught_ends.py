@@ -77,6 +77,8 @@ class Scribe:
     async def start(self) -> None:
         self._note("start")
 
+    is_guarded = True
+
     def submit(self, plan: SprayPlan) -> None:
         self.submitted.set()
         self._note("submit")

@@ -41,6 +41,27 @@ def test_what_is_written_passes_the_check(
     assert load(out).safety.modes == ("MISSION" if autopilot == "px4" else "AUTO",)
 
 
+@pytest.mark.parametrize(
+    ("autopilot", "output", "dither_us", "guard"),
+    [
+        ("ardupilot", "servo", 0, "auto"),
+        ("ardupilot", "servo 9 board", 8, "auto"),
+        ("ardupilot", "servo none", 0, "none-on-power-loss"),
+        ("px4", "servo", 8, "auto"),
+        ("px4", "servo 1 none", 0, "none-on-power-loss"),
+        ("px4", "gpio 5", 0, "auto"),
+    ],
+)
+def test_what_closes_without_power_is_written(
+    autopilot: str, output: str, dither_us: int, guard: str, tmp_path: Path
+) -> None:
+    out = tmp_path / "field.toml"
+    words = ["--autopilot", autopilot, "--output", output]
+    assert execute(["config", "new", "--yes", "--out", str(out), *words]) == 0
+    written = load(out).output
+    assert (written.dither_us, written.guard) == (dither_us, guard)
+
+
 def test_six_questions_are_asked_and_answered(tmp_path: Path) -> None:
     out = tmp_path / "field.toml"
     said = f"px4 udpin:0.0.0.0:14550\ngpio 5\n4 0.5\n03 at 3 bar\n{MAP}\n\n"
@@ -152,6 +173,7 @@ def test_every_profile_becomes_a_configuration(name: str, tmp_path: Path, capsys
         (["--autopilot", "betaflight"], "not an autopilot; write ardupilot or px4"),
         (["--link", "COM3"], "link.url"),
         (["--output", "relay"], "not an output; write servo 9, or gpio 5"),
+        (["--autopilot", "px4", "--output", "servo 1 script"], "PX4 has no watchdog script"),
         (["--valves", "0"], "number of valves"),
         (["--nozzle", "blue"], "flow of one valve"),
         (["--profile", "none"], "not known; write a .toml file, or one of"),

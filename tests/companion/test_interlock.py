@@ -96,6 +96,7 @@ CASES: dict[Inhibit, list[dict[str, object] | None]] = {
     Inhibit.RC_SWITCH: [{"rc_switch_on": False}, {"rc_switch_on": None}],
     Inhibit.OUTPUT_FAULT: [{"output_healthy": False}],
     Inhibit.LINK_LOST: [{"link_up": False}],
+    Inhibit.UNGUARDED: [{"output_guarded": False}, {"output_guarded": None}],
     Inhibit.ESTOP: [{"estop": True}, {"estop": None}],
     Inhibit.ACCURACY_TOO_LOW: [
         {"horizontal_accuracy_m": 0.301},

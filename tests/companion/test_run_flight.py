@@ -343,6 +343,8 @@ class Scribe:
     async def start(self) -> None:
         self._note("start")
 
+    is_guarded = True
+
     def submit(self, plan: SprayPlan) -> None:
         self._note("submit")
 

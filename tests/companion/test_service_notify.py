@@ -149,6 +149,8 @@ class Parts:
 
     def tell_fault(self, text: str) -> None: ...
 
+    is_guarded = True
+
     def submit(self, plan: SprayPlan) -> None:
         if self.is_broken:
             raise RuntimeError("broken")

@@ -69,6 +69,8 @@ class Bench:
     def tell_fault(self, text: str) -> None:
         self.texts.append(text)
 
+    is_guarded = True
+
     def submit(self, plan: SprayPlan) -> None:
         self.plans.append(plan)
 

@@ -81,6 +81,7 @@ class WirePeer:
         self.mission_state = 0  # not told
         self.servo_result = ACCEPTED
         self.is_silent = False
+        self.has_script = True
         self.orders: list[Order] = []
         self.messages: list[Any] = []
         self.outputs: dict[int, int] = {}
@@ -210,6 +211,8 @@ class WirePeer:
             if message.get_srcComponent() != 191:
                 continue
             self.messages.append(message)
+            if message.get_type() == "PARAM_REQUEST_READ":
+                self._tell_parameter(message.param_id)
             if message.get_type() == "COMMAND_LONG" and message.target_component == 1:
                 self._obey(message, at_s)
             if message.get_type() == "TIMESYNC" and message.tc1 == 0 and self.answers_time:
@@ -217,6 +220,13 @@ class WirePeer:
                 answer = self._mav.timesync_encode(round(boot_s * 1e9), message.ts1)
                 self.write(self._pack(self._mav, answer))
         self._news.set()
+
+    def _tell_parameter(self, name: str) -> None:
+        """Answer for the outputs, and that the watchdog script runs; other names are not there."""
+        if self.autopilot == 3 and name.startswith(("SERVO", "SPRAY_", "BRD_", "SPRW_")):
+            value = float(self.has_script and name == "SPRW_ENABLE")
+            found = self._mav.param_value_encode(name.encode(), value, 9, 1, 0)
+            self.write(bytes(found.pack(self._mav)))
 
     def _obey(self, command: Any, now_s: float) -> None:
         result = ACCEPTED

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import pickle
+import signal
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -11,6 +13,7 @@ from subprocess import Popen
 
 import pytest
 
+from tests.bench.dead_man import children_of
 from tests.firmware.fields import FIRST_M, ZONES_M, Track, pass_items, write_pass
 from tests.firmware.firmware import companion, end
 from tests.firmware.flights import (
@@ -69,13 +72,14 @@ def test_a_switch_a_command_a_mode_and_a_killed_companion_close(
             station.until(lambda: station.height_m > 3.0, "height")
             by_operator_s = _operators_stops(vehicle, radio)
             by_kill_s = [_killed(vehicle, first)]
+            by_guardian_s = []
             for number in range(2):
                 name = f"again-{number}.txt"
                 with companion(tmp_path, *options, name=name) as again:
                     _until_heard_anew(vehicle)
                     enable(station)
                     until_spraying(vehicle)
-                    by_kill_s.append(_killed(vehicle, again))
+                    by_guardian_s.append(_closed_by_guardian(vehicle, again))
         killed_s = time.monotonic()
         if kind is PX4:
             set_mode(vehicle, "land")
@@ -85,9 +89,12 @@ def test_a_switch_a_command_a_mode_and_a_killed_companion_close(
             tell(f"landed and disarmed: the outputs read {us}")
     for what, after_s in by_operator_s.items():
         tell(f"closed {after_s:.3f} s after {what}")
-    tell(f"closed {', '.join(f'{one:.3f}' for one in by_kill_s)} s after kill -9")
+    tell(f"closed {', '.join(f'{one:.3f}' for one in by_kill_s)} s after kill -9 of both processes")
+    by = ", ".join(f"{one:.3f}" for one in by_guardian_s)
+    tell(f"closed {by} s after kill -9, by the guardian")
     assert {what for what in by_operator_s if by_operator_s[what] > CLOSED_MAX_S[what]} == set()
     assert max(by_kill_s) <= KILLED_MAX_S
+    assert max(by_guardian_s) <= KILLED_MAX_S
 
 
 def _operators_stops(vehicle: Vehicle, radio: Radio) -> dict[str, float]:
@@ -121,13 +128,15 @@ def _operators_stops(vehicle: Vehicle, radio: Radio) -> dict[str, float]:
 
 
 def _killed(vehicle: Vehicle, started: Popen[bytes]) -> float:
-    """Kill the companion; return when all valves were closed, which must last.
+    """Kill companion and guardian, as a loss of power does; return when all valves were closed.
 
     By the watchdog script, or on PX4, which repeats the last order, by the board behind it.
     """
     station = vehicle.station
     texts = len(station.log.texts)
     opened = open_outputs(station.log.pulses[-1].us)
+    for child in children_of(started.pid):
+        os.kill(child, signal.SIGKILL)
     started.kill()
     killed_s = time.monotonic()
     if vehicle.kind is PX4:
@@ -142,6 +151,18 @@ def _killed(vehicle: Vehicle, started: Popen[bytes]) -> float:
     found_s = closing_s(vehicle, killed_s)
     started.wait()
     station.until(lambda: station.said("no sign of life, closed", since=texts), "watchdog")
+    closed_from = len(station.log.pulses)
+    station.for_s(1.0)
+    assert not any(open_outputs(one.us) for one in station.log.pulses[closed_from:])
+    return found_s
+
+
+def _closed_by_guardian(vehicle: Vehicle, started: Popen[bytes]) -> float:
+    """Kill the companion alone; return when all outputs of the autopilot were closed, for good."""
+    station = vehicle.station
+    started.kill()
+    found_s = closing_s(vehicle, time.monotonic())
+    started.wait()
     closed_from = len(station.log.pulses)
     station.for_s(1.0)
     assert not any(open_outputs(one.us) for one in station.log.pulses[closed_from:])

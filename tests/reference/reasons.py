@@ -165,6 +165,10 @@ CONDITIONS: dict[Inhibit, tuple[str, str, str, str]] = {
         "the link is up and belongs to one vehicle", "the companion", "-",
         "when the vehicle is heard again",
     ),
+    Inhibit.UNGUARDED: (
+        'with `output.guard = "auto"`: something closes servo outputs when the companion loses power: '
+        "`SPRW_ENABLE` is 1, or `output.dither_us` is set", "PARAM_VALUE", "-", "at once",
+    ),
     Inhibit.LEAK: ("no flow while all valves are closed", *_LIQUID),
     Inhibit.VALVE_STUCK_OPEN: ("no more flow than was ordered", *_LIQUID),
     Inhibit.NO_FLOW: ("liquid flows when it is ordered", *_LIQUID),

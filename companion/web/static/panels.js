@@ -140,7 +140,7 @@ export function showChecklist(state, facts, ground, checks) {
     ["Flight map", ground.zone_count > 0, `${ground.zone_count} zones, ${withUnit("area", ground.field_m2 / 10000)}`],
     ["Vehicle heard", none("no-heartbeat", "stale-heartbeat", "link-lost", "not-active"), vehicle.mode ?? ""],
     ["Position good enough", none("no-position", "stale-position", "invalid-position", "position-frozen", "clock-disagrees", "fix-too-low", "accuracy-too-low", "estimator-unhealthy", "heading-unknown", "far-from-field"), FIXES[vehicle.fix] ?? ""],
-    ["Outputs", none("output-fault", "leak", "valve-stuck-open", "no-flow", "flow-fault"), facts.output === "none" ? "no outputs: dry run" : facts.output],
+    ["Outputs", none("output-fault", "unguarded", "leak", "valve-stuck-open", "no-flow", "flow-fault"), facts.output === "none" ? "no outputs: dry run" : facts.output],
     ["No stop pressed", none("estop", "rearm-needed"), ""],
     ["Wind", none("wind-above-max", "wind-unknown"), vehicle.wind_m_s === null || vehicle.wind_m_s === undefined ? `not measured; at most ${withUnit("wind", facts.wind_max_m_s)}` : withUnit("wind", vehicle.wind_m_s)],
     ["Tank", level === null || level === undefined ? null : level > (facts.reserve_l ?? 0), level === null || level === undefined ? "enter what is in it under Tank" : withUnit("volume", level)],

@@ -91,7 +91,8 @@ def write_files(folder: Path, field_m: float) -> Path:
 
 def settings(output: str, url: str) -> list[str]:
     """Return the settings that a flight has beside those of the file."""
-    found = [f"link.url={url}", "prescription.unit=L/ha"]
+    # Where a script runs, it is another's than the stub's.
+    found = [f"link.url={url}", "prescription.unit=L/ha", "output.guard=none-on-power-loss"]
     if output == "gpio":
         found += ["output.kind=gpio", f"gpio.alive_line={ALIVE_LINE}"]
         found += [f"lag.{key}={value}" for key, value in lags("gpio").items()]

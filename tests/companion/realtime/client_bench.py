@@ -187,6 +187,8 @@ def write_field(folder: Path, autopilot: str) -> Path:
     (folder / "boundary.geojson").write_text(_features((outline, {})))
     config = folder / "config.toml"
     text = config.read_text().replace('"prescription.shp"', '"field.geojson"\nunit = "L/ha"')
+    # No script runs on this stub, and no board is behind it.
+    text = text.replace('kind = "servo"', 'kind = "servo"\nguard = "none-on-power-loss"')
     if autopilot == "px4":
         # Its channels are actuators, 1 to 6; the stub has them at its outputs 9 to 14.
         numbers = iter(range(1, 7))

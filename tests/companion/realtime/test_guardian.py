@@ -189,6 +189,30 @@ async def test_a_guardian_that_stands_still_closes(config: Path) -> None:
         await is_gone(guardian)
 
 
+async def test_without_script_or_board_nothing_is_sprayed_unless_the_file_says_so(
+    config: Path,
+) -> None:
+    async def opens(*settings: str) -> bool:
+        port, peer = free_port(), peer_in_the_middle()
+        peer.has_script = False
+        async with (
+            started(config, f"udpin:127.0.0.1:{port}", *settings) as process,
+            over_udp(peer, port),
+        ):
+            await peer.until(lambda: peer.is_ready, within_s=20.0)
+            peer.place(east_m=-6.0)
+            peer.enable()
+            refused = "Spray off: no watchdog script or board"
+            await peer.until(lambda: peer.is_spraying or refused in peer.texts(), within_s=20.0)
+            process.terminate()
+            await process.communicate()
+            return any(order.pulse_us > 1000 for order in peer.orders)
+
+    assert not await opens()
+    assert await opens("output.dither_us=8")
+    assert await opens("output.guard=none-on-power-loss")
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 async def test_an_end_in_order_leaves_no_guardian(config: Path, number: signal.Signals) -> None:
     async with spraying(config) as flight:
