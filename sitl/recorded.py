@@ -34,6 +34,8 @@ COLUMNS = (
 )  # fmt: skip
 # A log that pauses for longer is two flights. What is slower flies nowhere; so much is told before
 # it moves and after it stands.
+# No clock has run for so long since its start: what is more is a time of day.
+EPOCH_US = 1e14
 PAUSE_S, MOVING_M_S, BEFORE_S, AFTER_S, LEAST_S = 1.0, 1.0, 5.0, 3.0, 5.0
 
 
@@ -267,6 +269,7 @@ def _telemetry(path: Path) -> Recorded:
         "GLOBAL_POSITION_INT": [], "HEARTBEAT": [], "GPS_RAW_INT": []
     }  # fmt: skip
     now_s, boot_s, listener, autopilot = 0.0, 0.0, Listener(), None
+    fixed: list[tuple[float, float, float]] = []
     for frame in _frames(path.read_bytes()):
         for message in listener.messages(frame):
             kind, who = message.get_type(), sender(message)
@@ -279,6 +282,10 @@ def _telemetry(path: Path) -> Recorded:
                 continue
             autopilot, now_s = who, max(at_s, now_s)
             told[kind].append((now_s, message))
+            # ArduPilot and PX4 stamp a fix by their own clock; a time of day says nothing here.
+            if kind == "GPS_RAW_INT" and message.time_usec < EPOCH_US:
+                fixed_s = boot_s + message.time_usec * 1e-6
+                fixed.append((fixed_s, message.lat * 1e-7, message.lon * 1e-7))
     rows = [
         (
             at_s, m.lat * 1e-7, m.lon * 1e-7, m.relative_alt * 1e-3, m.vx * 0.01, m.vy * 0.01,
@@ -292,7 +299,7 @@ def _telemetry(path: Path) -> Recorded:
         modes=[(at_s, _copter(m.custom_mode)) for at_s, m in told["HEARTBEAT"]],
         armed=[(at_s, bool(m.base_mode & 128)) for at_s, m in told["HEARTBEAT"]],
         fixes=[(at_s, m.fix_type) for at_s, m in told["GPS_RAW_INT"]],
-        receiver=np.empty((3, 0)),  # these come when the link has room, with no stamp to go by
+        receiver=np.array(fixed).reshape(-1, 3).T,
     )
 
 

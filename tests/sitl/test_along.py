@@ -18,6 +18,7 @@ from sitl.along import (
     METHODS,
     AlongOptions,
     Bed,
+    _receiver,
     along_lines,
     figures_of,
     fly_along,
@@ -166,15 +167,51 @@ def test_how_late_and_how_far_off_a_receiver_is_against_the_estimate(log: Path) 
     assert found is not None
     assert found[0] == pytest.approx(0.08, abs=0.004)
     assert found[1] == pytest.approx(0.5, abs=0.02)
-    # Telemetry has no stamps of the receiver's own.
-    assert receiver_behind(flight, path, flown_logs.HOME) is None
+    # Telemetry stamps a fix by the autopilot's clock; a time of day is no such stamp.
+    found = receiver_behind(flight, path, flown_logs.HOME)
+    assert found is not None
+    assert found[0] == pytest.approx(flown_logs.BEHIND_S, abs=0.01)
+    assert found[1] < 0.05
+
+
+@pytest.mark.parametrize(
+    ("late_s", "off_m", "fix", "is_unusual"),
+    [
+        (0.08, 0.25, 6, False),
+        (0.01, 0.0, 6, True),
+        (0.3, 0.0, 6, True),
+        (-0.08, 0.0, 6, True),
+        (0.08, 0.4, 5, True),
+        (0.08, 0.4, 3, False),
+        (0.08, 0.6, 3, True),
+    ],
+)
+def test_an_unusual_delay_or_offset_of_a_receiver_is_said(
+    late_s: float, off_m: float, fix: int, is_unusual: bool, log: Path
+) -> None:
+    flight = replace(read_flight(log), fixes=[(100.0, fix)])
+    (text,) = _receiver(flight, (late_s, off_m))
+    assert "the delay the autopilot assumes" in text
+    assert ("UNUSUAL" in text) is is_unusual
+
+
+@needs_logs
+def test_what_a_ground_station_heard_tells_it_too() -> None:
+    """Positions at 1 Hz and a receiver of 2018, for which ArduPilot assumes more."""
+    flight = read_flight(LOGS / "phoenix-mission1.tlog")
+    states = flight.states
+    earth = Earth(float(states.latitude_deg[0]), float(states.longitude_deg[0]))
+    found = receiver_behind(flight, paths_of(flight, earth)[0], earth)
+    assert found is not None
+    assert found[0] == pytest.approx(0.2, abs=0.06)
+    assert found[1] < 0.5
 
 
 @needs_logs
 @pytest.mark.parametrize(("name", "late_ms"), [("q116", 88), ("q130", 58), ("q083", 102)])
 def test_receivers_of_real_flights_are_behind_their_estimates(name: str, late_ms: int) -> None:
     notes = " ".join(prepare(AlongOptions(log=LOGS / f"{name}.BIN")).notes)
-    assert f"lie {late_ms} ms behind" in notes
+    assert f"measured one): {late_ms} ms" in notes
     assert "UNUSUAL" not in notes
 
 
