@@ -47,7 +47,7 @@ __all__ = ["AUTOPILOT_COMPONENT", "Codec", "Vehicle"]
 
 Accept = Callable[[bytes, int], bool]
 
-_HEARTBEAT = 0
+_HEARTBEAT, _GPS_RAW_INT = 0, 24
 _HIL_ENABLED = 32  # MAV_MODE_FLAG_HIL_ENABLED
 _SENDERS_MAX = 64
 # So many frames in a row that seem overtaken, and their sender has begun to count anew.
@@ -99,6 +99,8 @@ class Codec:
         self.vehicle_frame_count = 0
         # Whether the vehicle's last heartbeat spoke of hardware in the loop of a simulation.
         self.is_hil = False
+        # Where the receiver itself says that the vehicle is, in degrees.
+        self.receiver: tuple[float, float] | None = None
 
     @property
     def vehicle(self) -> Vehicle | None:
@@ -184,6 +186,8 @@ class Codec:
             return None
         if message_id == _HEARTBEAT:
             self.is_hil = bool(raw.base_mode & _HIL_ENABLED)
+        elif message_id == _GPS_RAW_INT and raw.lat:
+            self.receiver = (raw.lat / 1e7, raw.lon / 1e7)
         return FROM_VEHICLE[message_id](raw, received_s)
 
     def _count(self, sender: tuple[int, int], number: int) -> bool:

@@ -98,6 +98,9 @@ def rated(name: str, rate_hz: float) -> Heard:
         (replace(GOOD, fix=None), "fix", Status.FAIL),
         (replace(GOOD, fix=Fix.FIX_3D), "fix", Status.FAIL),
         (replace(GOOD, is_estimator_healthy=None), "estimator", Status.WARN),
+        (replace(GOOD, receiver_off_m=0.25), "estimator", Status.OK),
+        (replace(GOOD, receiver_off_m=0.6), "estimator", Status.WARN),
+        (replace(GOOD, receiver_off_m=NAN), "estimator", Status.WARN),
         (replace(GOOD, is_estimator_healthy=False), "estimator", Status.FAIL),
         (replace(GOOD, position=None), "place", Status.FAIL),
         (
@@ -120,6 +123,14 @@ def test_each_fact_of_the_vehicle_has_its_verdict(heard: Heard, name: str, statu
     assert checks[name].status is status
     others = {check.status for other, check in checks.items() if other not in (name, "wind")}
     assert others == {Status.OK}
+
+
+def test_only_rtk_on_the_ground_says_that_the_estimate_is_off() -> None:
+    # Without RTK the receiver is no better; in flight it is late.
+    for heard in (replace(GOOD, fix=Fix.DGPS), replace(GOOD, is_armed=True)):
+        assert of_link(replace(heard, receiver_off_m=0.6))["estimator"].status is Status.OK
+    found = of_link(replace(GOOD, receiver_off_m=0.6))["estimator"]
+    assert "0.60 m from the RTK receiver's" in found.text
 
 
 def test_wind_counts_where_it_is_required() -> None:

@@ -181,7 +181,9 @@ class WirePeer:
                 9_000,
             ),
             74: lambda: mav.vfr_hud_encode(0.0, self.speed_m_s, 90, 0, 60.0, 0.0),
-            24: lambda: mav.gps_raw_int_encode(0, 6, 0, 0, 0, 0, 0, 0, 0, 20, h_acc=14),
+            24: lambda: mav.gps_raw_int_encode(
+                0, 6, round(latitude * 1e7), round(longitude * 1e7), 0, 0, 0, 0, 0, 20, h_acc=14
+            ),
             193: lambda: mav.ekf_status_report_encode(HEALTHY_EKF, 0.1, 0.1, 0.1, 0.1, 0.0),
             245: lambda: (
                 mav.extended_sys_state_encode(0, self.landed_state) if self.is_landed_told else None
