@@ -284,3 +284,28 @@ def test_one_stranger_leaves_room_for_the_next() -> None:
 
 def test_what_a_line_of_our_own_may_bring_is_ten_fast_serial_lines() -> None:
     assert KNOWN_BYTES[0] >= 10 * 92_160
+
+
+def test_all_strangers_together_have_a_share_and_the_last_ones_are_remembered() -> None:
+    counts = Counts()
+    intake = Intake(counts)
+    for number in range(500):
+        intake.put(FLOOD[:300], 0.002 * number, number, is_known=False)
+        assert len(intake._sources) <= SOURCES_MAX
+    assert 500 * 300 - counts.excess_bytes <= sum(STRANGERS_BYTES)
+
+
+async def test_what_waits_after_a_turn_brings_the_next_one() -> None:
+    async with linked(f"udpout:127.0.0.1:{free_port()}") as bench:
+        clock = itertools.count(100.0, 0.001)
+        bench.link._clock = lambda: next(clock)
+        bench.link._on_bytes(bytes(5 * SLICE_BYTES))
+        turns = 0
+        while bench.link._intake.has_more():
+            bench._news.clear()
+            bench.link.receive()
+            turns += 1
+            if bench.link._intake.has_more():
+                async with asyncio.timeout(5.0):
+                    await bench._news.wait()
+        assert turns == 5
