@@ -77,6 +77,8 @@ def test_a_switch_a_command_a_mode_and_a_killed_companion_close(
                 name = f"again-{number}.txt"
                 with companion(tmp_path, *options, name=name) as again:
                     _until_heard_anew(vehicle)
+                    # PX4 has kept its last order until now.
+                    closing_s(vehicle, time.monotonic(), 10.0)
                     enable(station)
                     until_spraying(vehicle)
                     by_guardian_s.append(_closed_by_guardian(vehicle, again))
