@@ -350,7 +350,7 @@ async def test_a_whole_flight_on_the_stub_is_watched_from_enable_to_landing(
     ):
         page = await browser.new_page()
         page.set_default_timeout(40_000)
-        await bench.until(lambda: "link up" in bench.said, within_s=30.0)
+        await bench.until(lambda: "operator's page:" in bench.said, within_s=30.0)
         await page.goto(f"http://127.0.0.1:{port}/")
         await expect(page.locator("#training")).to_contain_text("SIMULATED")
         flight = bench.stub.flight
