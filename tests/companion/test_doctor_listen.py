@@ -67,13 +67,14 @@ async def test_a_disarmed_vehicle_is_heard_and_ordered_closed_only() -> None:
     assert found.outputs_us == dict.fromkeys(range(9, 15), 1000)
     assert {order.pulse_us for order in peer.orders} == {1000}
     assert set(found.order_results) == {0}
-    # This peer answers no parameter, which is known after some seconds.
     assert found.parameters is not None
-    assert found.parameters["SPRW_ENABLE"] is None
+    assert found.parameters["SPRW_ENABLE"] == 1.0
 
 
 async def test_an_armed_vehicle_is_ordered_nothing() -> None:
     peer = WirePeer(FRAME, east_m=0.0)
+    # That it answers no parameter is known after some seconds.
+    peer._tell_parameter = lambda name: None  # type: ignore[method-assign]
     found = await heard(peer, wait_s=1.0)
     assert (found.is_armed, found.is_closed_ordered, peer.orders) == (True, False, [])
     assert found.parameters is None
