@@ -292,6 +292,7 @@ def test_all_strangers_together_have_a_share_and_the_last_ones_are_remembered() 
     for number in range(500):
         intake.put(FLOOD[:300], 0.002 * number, number, is_known=False)
         assert len(intake._sources) <= SOURCES_MAX
+        intake.take()
     assert 500 * 300 - counts.excess_bytes <= sum(STRANGERS_BYTES)
 
 
