@@ -209,6 +209,12 @@ def load(path: Path, *, overrides: Sequence[str] = ()) -> Config:
     origins: dict[str, Origin] = {key: "file" for key, _ in leaves(raw)}
     for override in overrides:
         origins.update((key, "override") for key in _apply(raw, override))
+    for key, value in leaves(raw):
+        texts = value if isinstance(value, list) else [value]
+        if any(isinstance(text, str) and "\0" in text for text in texts):
+            raise ConfigError(
+                f"{path}: {key} = {show_value(value)}: a NUL character; write the text without it"
+            )
     try:
         config = Config.model_validate(raw)
     except ValidationError as error:

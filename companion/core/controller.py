@@ -48,7 +48,15 @@ from companion.core.options.overlap import guarded, treated_before
 from companion.core.options.pump import constant_drive, liquid_of, modulated, on_off, sections
 from companion.core.options.treated_area import TreatedArea
 from companion.core.options.valve_tracking import TrackMemory
-from companion.core.safety import UNASKED, Permission, closed_plan, guard, permit, shown
+from companion.core.safety import (
+    NUMBER_MAX,
+    UNASKED,
+    Permission,
+    closed_plan,
+    guard,
+    permit,
+    shown,
+)
 from companion.core.schedule import (
     STICKY_S,
     Dosing,
@@ -125,8 +133,13 @@ class Orders(NamedTuple):
 def step(
     setup: Setup, state: VehicleState | None, memory: Memory, now_s: float
 ) -> tuple[Decision, Memory]:
-    """Return what to do from `now_s` on, and what the next step has to know."""
+    """Return what to do from `now_s` on, and what the next step has to know.
+
+    It raises for no state and no time: all closes where one is no number.
+    """
     before, ordering = memory.plan, memory.ordering
+    if not abs(now_s) < NUMBER_MAX:  # the clock is broken: closed since the last step
+        now_s, state = 0.0 if before is None else before.issued_s, None
     liquid = liquid_of(setup.pumping, before)
     watched = _watch(
         setup, state, memory.watched, before, liquid,

@@ -197,6 +197,29 @@ def _wind(state: VehicleState, limits: Limits, now_s: float) -> list[Inhibit]:
     return found
 
 
+# No place, speed, time or turn of a flight is larger.
+NUMBER_MAX = 1e9
+
+
+def _is_motion(state: VehicleState) -> bool:
+    """Return whether a path can be foretold from it: numbers all, and none divides by 0.
+
+    Place, speed and height have limits of their own.
+    """
+    stop = state.stop_ahead
+    numbers = (
+        state.time_s, state.acceleration_east_m_s2, state.acceleration_north_m_s2,
+        state.outrun_east_m_s, state.outrun_north_m_s,
+        state.yaw_rate_deg_s, state.yaw_gain_deg_s2, state.rate_percent,
+        0.0 if stop is None else stop.distance_m,
+    )  # fmt: skip
+    if not 0.0 < state.acceleration_fade_s < NUMBER_MAX:
+        return False
+    if stop is not None and not 0.0 < stop.braking_m_s2 < NUMBER_MAX:
+        return False
+    return all(abs(number) < NUMBER_MAX for number in numbers)
+
+
 def _position(
     state: VehicleState,
     limits: Limits,
@@ -206,7 +229,7 @@ def _position(
     found = []
     if not -0.1 <= now_s - state.position_received_s <= limits.position_age_max_s:
         found.append(Inhibit.STALE_POSITION)
-    if not state.position_valid:
+    if not (state.position_valid and _is_motion(state)):
         found.append(Inhibit.INVALID_POSITION)
     if state.position_frozen is not False:
         found.append(Inhibit.POSITION_FROZEN)

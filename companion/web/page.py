@@ -47,6 +47,7 @@ from companion.simulated import SIMULATED
 
 # A frame that does not fit its slot goes without what stands for each valve.
 _LONG = ("duty", "rates_l_ha")
+_SHORT_BYTES = 500
 
 
 def number(value: float | None, digits: int = 2) -> float | None:
@@ -135,11 +136,21 @@ def _liquid(state: VehicleState, now_s: float) -> dict[str, Any]:
 
 
 def packed(frame: dict[str, Any], most_bytes: int) -> bytes:
-    """Return a frame as JSON of at most `most_bytes`, without the valves where it needs be."""
-    data = json.dumps(frame, separators=(",", ":"), allow_nan=False).encode()
-    if len(data) <= most_bytes:
-        return data
-    return packed({key: value for key, value in frame.items() if key not in _LONG}, most_bytes)
+    """Return a frame as JSON of at most `most_bytes`, without the valves where it needs be.
+
+    Names that are long without end leave only what is short.
+    """
+    data = _json(frame)
+    if len(data) > most_bytes:
+        data = _json({key: value for key, value in frame.items() if key not in _LONG})
+    if len(data) > most_bytes:
+        short = {key: value for key, value in frame.items() if len(_json(value)) <= _SHORT_BYTES}
+        data = _json({key: [] for key in frame if key not in _LONG} | short)
+    return data
+
+
+def _json(value: object) -> bytes:
+    return json.dumps(value, separators=(",", ":"), allow_nan=False).encode()
 
 
 def map_object(setup: Setup) -> dict[str, Any]:

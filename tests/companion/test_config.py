@@ -338,6 +338,19 @@ def test_broken_file_is_refused_in_one_line(tmp_path: Path, content: bytes, expe
     assert expected in text
 
 
+@pytest.mark.parametrize(
+    "key", ["journal.folder", "prescription.file", "prescription.exclusions", "valve[0].name"]
+)
+def test_a_nul_is_refused_in_one_line(tmp_path: Path, key: str) -> None:
+    """No file can have such a name, and what asks for one raises where nobody expects it."""
+    path = tmp_path / "config.toml"
+    path.write_text(MEASURED)
+    text = '["a", "b\\u0000c"]' if key.endswith("exclusions") else '"b\\u0000c"'
+    said = refusal(path, f"{key}={text}")
+    assert said.startswith(f"{path}: {key} = ")
+    assert said.endswith(": a NUL character; write the text without it")
+
+
 def test_path_that_is_no_file_is_refused(tmp_path: Path) -> None:
     assert "no such file" in refusal(tmp_path / "none.toml")
     assert "is a directory" in refusal(tmp_path)

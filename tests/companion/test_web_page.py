@@ -17,7 +17,7 @@ import pytest
 import pytest_asyncio
 
 from companion.core.controller import Memory, step
-from companion.core.types import Decision, Inhibit, SprayerState
+from companion.core.types import Decision, FaultKind, Finding, Inhibit, SprayerState
 from companion.errors import ConfigError
 from companion.link.component import Component, ComponentOptions
 from companion.web import OperatorPage, Order, Outcome, listen
@@ -121,6 +121,24 @@ def test_a_frame_has_no_nan_and_fits_its_slot_with_any_boom(site: Site) -> None:
     data = packed(frame_of(wide, horizon_s=0.5), PAYLOAD_MAX)
     assert len(data) <= PAYLOAD_MAX
     assert json.loads(data)["state"] == decision.sprayer.value
+
+
+@pytest.mark.parametrize("length", [100, 1_000, 100_000])
+def test_a_frame_fits_its_slot_however_long_the_names_of_valves_are(
+    site: Site, length: int
+) -> None:
+    decision = site.show()
+    found = tuple(
+        Finding(kind=FaultKind.LEAK, at_s=1.0, text="ä" * length, valve=number)
+        for number in range(8)
+    )
+    frame = frame_of(dataclasses.replace(decision, findings=found), horizon_s=0.5)
+    frame["events"] = [(1.0, "link", "ä" * 200)] * 6
+    frame["more"] = {"é" * length: "ü" * length}
+    told = json.loads(packed(frame, PAYLOAD_MAX))
+    assert len(packed(frame, PAYLOAD_MAX)) <= PAYLOAD_MAX
+    assert told["state"] == decision.sprayer.value
+    assert told["vehicle"] == frame["vehicle"]
 
 
 def test_every_reason_says_what_to_do() -> None:
