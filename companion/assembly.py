@@ -24,6 +24,7 @@ from companion.core.options.overlap import OverlapGuard
 from companion.core.options.pump import Pump
 from companion.core.options.valve_tracking import ValveTracking
 from companion.core.setup import Setup
+from companion.core.standing import MOST_M_S2
 from companion.core.types import PwmLimits
 from companion.errors import ConfigError, MapError, Problem
 from companion.flight_map import (
@@ -145,6 +146,7 @@ def build_setup(config: Config, flight_map: FlightMap) -> Setup:
         # Without an output nothing is sprayed, whatever the plans say.
         record_coverage=config.coverage.record and config.output.kind != "none",
         overlap=_overlap(config),
+        most_m_s2=MOST_M_S2 if config.mission is None else config.mission.acceleration_m_s2,
     )
 
 

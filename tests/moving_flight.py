@@ -10,12 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from companion.core.types import Decision
 from sitl.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -126,3 +128,105 @@ def fell_outside(
 def circle(radius_m: float, speed_m_s: float) -> float:
     """Return the turn [deg/s] that flies a circle of this radius."""
     return math.degrees(speed_m_s / radius_m)
+
+
+# ------------------------------------------------------------------ ours, and a causal reference
+
+Orders = list[list[tuple[float, float]]]
+# Of a valve: from when until when something may flow.
+Spans = Sequence[tuple[float, float]]
+JUDGED_S = 0.01
+
+
+def executed(decisions: Sequence[Decision], count: int) -> Orders:
+    """Return the changes of the valves that come to pass: each plan's until the next one.
+
+    A plan that has a valve shut from its beginning shuts it: that of an interlock.
+    """
+    orders: Orders = [[] for _ in range(count)]
+    for here, then in pairwise(decisions):
+        for own, duty in zip(orders, here.plan.duty, strict=True):
+            if duty == 0.0 and own and own[-1][1] > 0.0:
+                own.append((here.now_s, 0.0))
+        for change in here.plan.changes:
+            if change.at_s <= then.now_s:
+                orders[change.valve].append((change.at_s, change.duty))
+    return orders
+
+
+class Strip(NamedTuple):
+    """A valve's strip beside the position reference, and when its flow begins and ends."""
+
+    right_m: float
+    forward_m: float
+    width_m: float
+    first_s: float
+    last_s: float
+
+    def ends(self, east: Floats, north: Floats, nose_deg: Floats) -> Floats:
+        """Return both ends (n, 2, 2) of the strip, for places of the reference."""
+        sin, cos = np.sin(np.radians(nose_deg)), np.cos(np.radians(nose_deg))
+        return np.stack(
+            [
+                np.column_stack(
+                    (
+                        east + side_m * cos + self.forward_m * sin,
+                        north - side_m * sin + self.forward_m * cos,
+                    )
+                )
+                for side_m in (
+                    self.right_m - self.width_m / 2.0,
+                    self.right_m + self.width_m / 2.0,
+                )
+            ],
+            axis=1,
+        )
+
+    def beyond_m(self, field: shapely.Geometry, flown: Trajectory, spans: Spans) -> float:
+        """Return how far outside something fell at most."""
+        end_s = float(flown.time_s[-1])
+        times = [np.arange(a, min(b, end_s), JUDGED_S) for a, b in spans if min(b, end_s) > a]
+        if not times:
+            return 0.0
+        at = flown.at(np.concatenate(times))
+        lines = shapely.linestrings(self.ends(at.east_m, at.north_m, at.heading_deg))
+        outside = shapely.get_coordinates(shapely.difference(lines, field))
+        away = shapely.distance(shapely.points(outside), field)
+        return float(away.max(initial=0.0))
+
+
+def by_reference(
+    field: shapely.Geometry, strip: Strip, flown: Trajectory, at_s: Floats
+) -> list[tuple[float, float]]:
+    """Return the orders of who knows the true state, and takes its acceleration for constant.
+
+    At the same times as ours. It closes when the strip would be outside when the flow ends, and
+    opens when it would be inside when the flow begins, and then.
+    """
+    at = flown.at(at_s)
+    # The acceleration and the turn that have been, up to now: nobody knows those to come.
+    before = flown.at(at_s - STEP_S)
+    gain_e = (at.velocity_east_m_s - before.velocity_east_m_s) / STEP_S
+    gain_n = (at.velocity_north_m_s - before.velocity_north_m_s) / STEP_S
+    turn = (at.heading_deg - before.heading_deg) / STEP_S
+    shapely.prepare(field)
+
+    def inside(by_s: float) -> NDArray[np.bool_]:
+        ends = strip.ends(
+            at.east_m + at.velocity_east_m_s * by_s + 0.5 * gain_e * by_s**2,
+            at.north_m + at.velocity_north_m_s * by_s + 0.5 * gain_n * by_s**2,
+            at.heading_deg + turn * by_s,
+        )
+        found: NDArray[np.bool_] = shapely.covers(field, shapely.linestrings(ends))
+        return found
+
+    stays, begins = inside(strip.last_s), inside(strip.first_s)
+    orders, is_open = [], False
+    for time_s, may_stay, may_begin in zip(
+        at_s.tolist(), stays.tolist(), begins.tolist(), strict=True
+    ):
+        wanted = may_stay and (is_open or may_begin)
+        if wanted is not is_open:
+            orders.append((time_s, float(wanted)))
+            is_open = wanted
+    return orders

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -45,7 +46,14 @@ from companion.core.options.drift import is_same, landed, offset
 from companion.core.options.flow_trim import TrimMemory
 from companion.core.options.lines import add_off_lines
 from companion.core.options.overlap import guarded, treated_before
-from companion.core.options.pump import constant_drive, liquid_of, modulated, on_off, sections
+from companion.core.options.pump import (
+    Pumping,
+    constant_drive,
+    liquid_of,
+    modulated,
+    on_off,
+    sections,
+)
 from companion.core.options.treated_area import TreatedArea
 from companion.core.options.valve_tracking import TrackMemory
 from companion.core.safety import (
@@ -67,11 +75,14 @@ from companion.core.schedule import (
     sticky_border_s,
 )
 from companion.core.setup import Setup
+from companion.core.standing import Flowing, Standing, standing
 from companion.core.types import (
     Decision,
+    DriveChange,
     DrivePlan,
     Finding,
     Inhibit,
+    Method,
     SprayPlan,
     TimedChange,
     VehicleState,
@@ -159,6 +170,9 @@ def step(
     routes = _routes(setup, state, memory.routes, watched.area, now_s)
     watched = _settled(watched, now_s, is_busy=routes.found_from is state)
     orders = _orders(setup, state, routes.routes, ordering, watched, before, now_s)
+    stands = _stands(setup, state, routes)
+    if stands is not None and not orders.ordering.is_early:
+        orders = orders._replace(valves=_kept(setup, stands, orders, now_s))
     plan = SprayPlan(
         sequence=sequence,
         issued_s=now_s,
@@ -168,6 +182,8 @@ def step(
     )
     if setup.pump is not None or setup.atomisers:
         drives = _drives(setup, state, plan, routes.routes, orders, before, watched.ran_s)
+        if stands is not None and setup.pumping is not None:
+            drives = (_kept_drive(setup.pumping, stands, plan, drives[0]), *drives[1:])
         plan = replace(plan, drives=drives)
     plan = guard(plan, permission.reasons, lease_s=setup.lease_s)
     decision, ordering = _decision(setup, state, plan, routes.routes, orders, watched, permission)
@@ -448,6 +464,44 @@ def _scheduled(
     return valves
 
 
+def _stands(setup: Setup, state: VehicleState, routes: KnownRoutes) -> Standing | None:
+    """Return where the boom is by its present state, if it is near what nothing may fall on."""
+    if setup.guarded is None or routes.found_from is not state:
+        return None
+    return standing(
+        setup.guarded, state, setup.boom,
+        most_m_s2=setup.most_m_s2, drift_m=routes.drift_m, within_s=setup.flows_s,
+    )  # fmt: skip
+
+
+def _kept(setup: Setup, stands: Standing, orders: Orders, now_s: float) -> list[ValveSchedule]:
+    """Return the changes of the valves without those that the present state alone forbids."""
+    flowing = []
+    for valve, (timing, one) in enumerate(zip(setup.timings, orders.valves, strict=True)):
+        # A pulse in the middle of its period comes so much later, if nothing follows soon.
+        gaps = (b.at_s - a.at_s for a, b in pairwise(one.changes))
+        is_alone = next(gaps, math.inf) >= timing.alone_s
+        opens = max((change.duty for change in one.changes), default=0.0)
+        duty = orders.in_force[valve] or opens
+        flowing.append(
+            Flowing(
+                (valve,),
+                orders.in_force[valve] > 0.0,
+                [(change.at_s, change.duty) for change in one.changes],
+                timing.border_on_s + (timing.rest_s(duty) if is_alone else 0.0),
+                timing.border_off_s,
+            )
+        )
+    each = enumerate(zip(orders.valves, stands.kept(flowing), strict=True))
+    return [
+        one if count is None else one._replace(
+            changes=one.changes[:count] if count >= 0
+            else (TimedChange(at_s=now_s, valve=valve, duty=0.0),)
+        )
+        for valve, (one, count) in each
+    ]  # fmt: skip
+
+
 def _in_turn(
     setup: Setup,
     state: VehicleState,
@@ -564,6 +618,29 @@ def _drives(
                 )
             )  # fmt: skip
     return tuple(drives)
+
+
+def _kept_drive(pumping: Pumping, stands: Standing, plan: SprayPlan, drive: DrivePlan) -> DrivePlan:
+    """Return a pump's plan without what the present state alone forbids, where it makes the edges.
+
+    With a return valve the sections do. Behind valves alone it starts over those that are open.
+    """
+    if pumping.pump.outlet == "return" or pumping.method is not Method.SCHEDULED:
+        return drive
+    changes = [(change.at_s, change.fraction) for change in drive.changes]
+    timing = pumping.timing
+    every = range(len(stands.boom.valves))
+    one = Flowing(every, drive.fraction > 0.0, changes, timing.border_on_s, timing.border_off_s)
+    if pumping.pump.outlet == "valves":
+        opening = one.opening()
+        flows_s = plan.issued_s if opening is None else opening[1] + timing.border_on_s
+        duty = plan.duty_at(flows_s)
+        one = one._replace(valves=[valve for valve in every if duty[valve] > 0.0])
+    (count,) = stands.kept([one])
+    if count is None:
+        return drive
+    stop = (DriveChange(at_s=plan.issued_s, fraction=0.0),)
+    return replace(drive, changes=drive.changes[:count] if count >= 0 else stop)
 
 
 def _decision(

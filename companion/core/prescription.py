@@ -44,6 +44,10 @@ class Zone:
             raise ValueError(f"zone {self.name} is empty or not a valid polygon")
 
 
+# Farther from a field no vehicle is permitted to spray.
+BEYOND_M = 1e5
+
+
 # The owner of the polygons and edges of the field, beside the zones' 0, 1, 2, ...
 FIELD = -1
 
@@ -76,6 +80,7 @@ class Near(NamedTuple):
 
     within: Box
     edges: list[tuple[float, float, float, float, PlainEdge]]
+    border: list[tuple[float, float, float, float, PlainEdge]]  # those of the field alone
     parts: NDArray[np.object_]
     boxes: list[list[float]]
     owners: list[int]
@@ -87,12 +92,12 @@ class Near(NamedTuple):
         west, south, east, north = self.within
         return west <= box[0] and south <= box[1] and box[2] <= east and box[3] <= north
 
-    def edges_in(self, box: Box) -> list[PlainEdge]:
+    def edges_in(self, box: Box, *, of_border: bool = False) -> list[PlainEdge]:
         """Return the edges whose boxes meet a box that it covers."""
         west, south, east, north = box
         return [
             edge
-            for w, s, e, n, edge in self.edges
+            for w, s, e, n, edge in (self.border if of_border else self.edges)
             if w <= east and s <= north and e >= west and n >= south
         ]
 
@@ -173,6 +178,16 @@ class Prescription:
         self._near: Near | None = None
 
     @cached_property
+    def without_border(self) -> Prescription | None:
+        """Return ground without an end and with this field's holes; None where it has none."""
+        rings = [ring for part in shapely.get_parts(self.field) for ring in part.interiors]
+        if not rings:
+            return None
+        west, south, east, north = self.bounds_m
+        ground = shapely.box(west - BEYOND_M, south - BEYOND_M, east + BEYOND_M, north + BEYOND_M)
+        return Prescription([], boundary=ground, exclusions=[Polygon(ring) for ring in rings])
+
+    @cached_property
     def zones(self) -> tuple[Zone, ...]:
         """Return the zones; of cells, the ground of each class, joined when it is asked for."""
         if self.cells is None:
@@ -232,9 +247,11 @@ class Prescription:
             plain = zip(*ends.T.tolist(), owner.tolist(), strict=True)
             boxes = np.hstack([low, high]).tolist()
             parts = self._tree.query(shapely.box(*within))
+            edges = [(w, s, e, n, edge) for (w, s, e, n), edge in zip(boxes, plain, strict=True)]
             found = self._near = Near(
                 within,
-                [(w, s, e, n, edge) for (w, s, e, n), edge in zip(boxes, plain, strict=True)],
+                edges,
+                [each for each in edges if each[4][4] == FIELD],
                 self._parts[parts][:, None],
                 self._boxes[parts].tolist(),
                 self._owner[parts].tolist(),

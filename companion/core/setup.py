@@ -22,6 +22,7 @@ from companion.core.options.valve_tracking import Tracking, ValveTracking
 from companion.core.prescription import Prescription
 from companion.core.safety import Limits
 from companion.core.schedule import LagModel, Timing
+from companion.core.standing import MOST_M_S2
 from companion.core.types import Method, PwmLimits
 
 
@@ -58,12 +59,17 @@ class Setup:
     valve_tracking: ValveTracking | None = None  # None: valves stay as configured
     # The output opens a valve with a new period, the pulse in its middle: our own engine does.
     centres_pulses: bool = False
+    most_m_s2: float = MOST_M_S2  # the vehicle's acceleration
+    # Where nothing may fall outside, whatever was foretold: `standing.py`.
+    guarded: Prescription | None = field(init=False, repr=False, compare=False)
     timing: Timing = field(init=False, repr=False, compare=False)
     timings: tuple[Timing, ...] = field(init=False, repr=False, compare=False)  # of each valve
     # The longest lead of any order: of valves, pump and atomisers.
     longest_s: float = field(init=False, repr=False, compare=False)
     # All leads of orders, in order: a path in a turn is exact there.
     leads_s: tuple[float, ...] = field(init=False, repr=False, compare=False)
+    # Within this, what is ordered now has its first or last flow.
+    flows_s: float = field(init=False, repr=False, compare=False)
     # How far behind a path begins, so that short stays are seen whole.
     back_s: float = field(init=False, repr=False, compare=False)
     # How far ahead a path must reach: the lease, the longest lead and a short stay.
@@ -84,11 +90,14 @@ class Setup:
         braking_m_s2 = self.mission_braking_m_s2
         if braking_m_s2 is not None and not 0.1 <= braking_m_s2 <= 20.0:
             raise ValueError(f"mission_braking_m_s2 must lie in [0.1, 20], got {braking_m_s2}")
+        if not 0.0 < self.most_m_s2 <= 20.0:
+            raise ValueError(f"most_m_s2 must lie in (0, 20], got {self.most_m_s2}")
         if not self.nozzle_sets:
             raise ValueError("at least one nozzle set is needed")
         count = len(self.boom.valves)
         if any(valve >= count for nozzles in self.nozzle_sets for valve in nozzles.valves):
             raise ValueError("a nozzle set names a valve that the boom does not have")
+        object.__setattr__(self, "guarded", self._guarded())
         object.__setattr__(self, "timing", self._timing(self.lag))
         timings = tuple(self._timing(self.lag.of_valve(valve)) for valve in self.boom.valves)
         object.__setattr__(self, "timings", timings)
@@ -96,6 +105,11 @@ class Setup:
         stays_s = 2.0 * max(timing.dwell_min_s for timing in timings)
         object.__setattr__(self, "leads_s", self._leads_s())
         object.__setattr__(self, "longest_s", self.leads_s[-1])
+        flows_s = [max(timing.border_on_s, timing.border_off_s) for timing in timings]
+        if self.pumping is not None:
+            pump = self.pumping.timing
+            flows_s += [pump.border_on_s, pump.border_off_s]
+        object.__setattr__(self, "flows_s", self.lease_s + max(flows_s))
         object.__setattr__(self, "back_s", 0.1 + stays_s)
         ahead_s = self.lease_s + (self.longest_s + stays_s) + ROUTES_KEPT_S + 0.05
         object.__setattr__(self, "ahead_s", ahead_s)
@@ -111,6 +125,12 @@ class Setup:
         object.__setattr__(self, "watching", watching)
         object.__setattr__(self, "tracking", self._tracking())
         object.__setattr__(self, "recording", self._recording() if self.records_coverage else None)
+
+    def _guarded(self) -> Prescription | None:
+        """Return the field; where its border is judged by volume, the ground without its holes."""
+        if self.method is not Method.SCHEDULED:
+            return None
+        return self.prescription if self.border == "inside" else self.prescription.without_border
 
     def _timing(self, lag: LagModel) -> Timing:
         return Timing.of(

@@ -1,0 +1,163 @@
+"""The law of the border: no more falls outside than who knows the true state could not help.
+
+Any path with accelerations to 5 m/s2 and turns to 120 degrees a second, gusts, any mix of lags
+beside each other, any field with holes, through messages; against a causal reference.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+from shapely.affinity import rotate, translate
+
+from companion.core.prescription import Prescription, Zone
+from companion.core.schedule import LagModel
+from companion.core.setup import Setup
+from companion.core.types import Decision
+from sitl.flight import FlightOptions, fly
+from sitl.profile import load_profile
+from sitl.trajectory import Trajectory
+from tests.border_flight import flows
+from tests.builders import boom, setup
+from tests.moving_flight import STEP_S, Stretch, Strip, by_reference, executed, way
+
+FLIGHTS = 400 if os.environ.get("HYPOTHESIS_PROFILE") == "thorough" else 12
+FLOWN = settings(max_examples=FLIGHTS, phases=[Phase.explicit, Phase.generate])
+MOST_M_S2, MOST_DEG_S = 5.0, 120.0
+SLOWEST_M_S, FASTEST_M_S = 1.2, 10.0
+MORE_M = 0.05
+# An acceleration is believed within so long; where a closing takes seconds, it counts.
+BELIEVED_S = 0.3
+PLANT = load_profile("wang-2024")
+
+
+class Flight(NamedTuple):
+    """A way with its field, and how long its valves take."""
+
+    flown: Trajectory
+    field: shapely.Geometry
+    lag: LagModel
+
+
+@st.composite
+def ways(draw: st.DrawFn) -> Trajectory:
+    """Straight, then anything that a vehicle may do; in gusts or without."""
+    speed = draw(st.floats(2.5, 8.0))
+    stretches, begins_m_s = [Stretch(2.5)], speed
+    for _ in range(draw(st.integers(2, 6))):
+        seconds = draw(st.floats(0.2, 1.5))
+        gain = draw(st.one_of(st.just(0.0), st.floats(-MOST_M_S2, MOST_M_S2)))
+        ends = min(max(speed + gain * seconds, SLOWEST_M_S), FASTEST_M_S)
+        gain = (ends - speed) / seconds
+        aside = math.sqrt(max(MOST_M_S2**2 - gain**2, 0.0)) / max(speed, ends)
+        most = min(MOST_DEG_S, math.degrees(aside))
+        turn = draw(st.one_of(st.just(0.0), st.floats(-most, most)))
+        nose = draw(st.one_of(st.none(), st.floats(-MOST_DEG_S, MOST_DEG_S)))
+        stretches.append(Stretch(seconds, gain, turn, nose))
+        speed = ends
+    count = sum(round(each.seconds / STEP_S) for each in stretches) + 1
+    return way(
+        stretches,
+        speed_m_s=begins_m_s,
+        course_deg=draw(st.floats(0.0, 360.0)),
+        crab_deg=draw(st.floats(-40.0, 40.0)),
+        pushed=gusts(count, draw(st.sampled_from([0.0, 0.3])), draw(st.integers(0, 99))),
+    )
+
+
+def gusts(count: int, sd_m_s: float, seed: int) -> np.ndarray:
+    """Return what gusts add to the velocity; they last for 1.5 s."""
+    keeps = math.exp(-STEP_S / 1.5)
+    kicks = np.random.default_rng(seed).normal(size=(count, 2)) * sd_m_s * math.sqrt(1 - keeps**2)
+    pushed = np.zeros((count, 2))
+    for i in range(1, count):
+        pushed[i] = keeps * pushed[i - 1] + kicks[i]
+    return pushed
+
+
+@st.composite
+def flights(draw: st.DrawFn, *, slowest_s: float) -> Flight:
+    """A field somewhere on the way, with holes on it; valves that take up to `slowest_s`."""
+    flown = draw(ways())
+    last = len(flown.time_s) - 1
+
+    def place() -> tuple[float, float]:
+        at = draw(st.integers(last // 4, last))
+        return float(flown.east_m[at]), float(flown.north_m[at])
+
+    field = rotate(shapely.box(-25.0, -25.0, 25.0, 25.0), draw(st.floats(0.0, 90.0)))
+    east_m, north_m = place()
+    aside = st.floats(-25.0, 25.0)
+    field = translate(field, east_m + draw(aside), north_m + draw(aside))
+    for radius_m in draw(st.lists(st.sampled_from([0.3, 1.5, 4.0]), max_size=3)):
+        east_m, north_m = place()
+        beside = st.floats(-3.0, 3.0)
+        middle = shapely.Point(east_m + draw(beside), north_m + draw(beside))
+        field = shapely.difference(field, middle.buffer(radius_m, quad_segs=3))
+    short, own = st.floats(0.0, 0.1), st.floats(0.0, slowest_s)
+    on_start_s, off_s, any_s = draw(own), draw(own), st.floats(0.1, 5.0)
+    lag = LagModel(
+        on_s=on_start_s + draw(short), off_s=off_s, up_s=draw(any_s), down_s=draw(any_s),
+        on_start_s=on_start_s, off_end_s=off_s + draw(short), output_s=draw(st.floats(0.0, 0.03)),
+    )  # fmt: skip
+    return Flight(flown, field, lag)
+
+
+def made_of(flight: Flight) -> Setup:
+    parts = [part for part in shapely.get_parts(flight.field) if part.area > 0.01]
+    zones = [Zone(name=str(n), polygon=shapely.Polygon(part.exterior), rate_l_ha=20.0)
+             for n, part in enumerate(parts)]  # fmt: skip
+    return setup(
+        prescription=Prescription(zones, boundary=flight.field), boom=boom(6), lag=flight.lag,
+        most_m_s2=MOST_M_S2,
+    )  # fmt: skip
+
+
+def worse_than_reference_m(flight: Flight, late_s: float) -> float:
+    """Return by how much more any valve sprayed outside than the reference's."""
+    made, lag = made_of(flight), flight.lag
+    said: list[Decision] = []
+    fly(
+        made, flight.flown, PLANT, FlightOptions(fidelity="averaged", noise=False),
+        speed_m_s=5.0, observer=said.append,
+    )  # fmt: skip
+    steps_s = np.array([each.now_s for each in said])
+    worst_m = 0.0
+    for valve, orders in zip(made.boom.valves, executed(said, 6), strict=True):
+        first_s, last_s = lag.on_start_s + lag.output_s, lag.off_end_s + lag.output_s
+        strip = Strip(valve.right_m, valve.forward_m, valve.width_m, first_s, last_s)
+        here = flows(orders, first_s=first_s, last_s=last_s)
+        own_m = strip.beyond_m(flight.field, flight.flown, here)
+        if own_m <= worst_m:
+            continue
+        ordered = by_reference(flight.field, strip, flight.flown, steps_s)
+        # Who is late closes late, and opens no sooner.
+        late = sorted([(at_s + (0.0 if value else late_s), value) for at_s, value in ordered])
+        theirs_m = max(
+            strip.beyond_m(flight.field, flight.flown, flows(one, first_s=first_s, last_s=last_s))
+            for one in (ordered, late)
+        )
+        worst_m = max(worst_m, own_m - theirs_m)
+    return worst_m
+
+
+@FLOWN
+@given(flight=flights(slowest_s=0.15))
+def test_valves_spray_no_more_outside_than_who_knows_the_true_state(flight: Flight) -> None:
+    if shapely.area(flight.field) > 1.0:
+        assert worse_than_reference_m(flight, 0.0) <= MORE_M
+
+
+@FLOWN
+@given(flight=flights(slowest_s=5.0))
+def test_what_takes_seconds_to_close_does_so_as_soon_as_an_acceleration_is_believed(
+    flight: Flight,
+) -> None:
+    if shapely.area(flight.field) > 1.0:
+        assert worse_than_reference_m(flight, BELIEVED_S) <= MORE_M
