@@ -18,7 +18,8 @@ import numpy as np
 
 from companion.core.arithmetic import log
 from companion.core.braking import CREEP_M_S, braking_begins_s
-from companion.core.frame import Box, Floats, Offset, PlainEdge
+from companion.core.frame import Box, Floats, Offset, PlainEdge, course_deg
+from companion.core.inputs import MISSION_MODES
 from companion.core.motion import Turning, gained_s
 from companion.core.types import StopAhead, VehicleState
 
@@ -421,7 +422,13 @@ def sweep_at(state: VehicleState, dt_s: float) -> Sweep:
     east, north, _, _ = _carried(
         state, dt_s, state.acceleration_east_m_s2, state.acceleration_north_m_s2
     )
-    angle = math.radians((state.heading_deg or 0.0) + turned_deg)
+    heading_deg = state.heading_deg or 0.0
+    if state.mode in MISSION_MODES:
+        # A mission turns the nose to its course, and no farther.
+        to_course_deg = (course_deg(east, north) - heading_deg + 180.0) % 360.0 - 180.0
+        if turned_deg * to_course_deg > 0.0 and abs(turned_deg) > abs(to_course_deg):
+            turned_deg, rate_deg_s = to_course_deg, 0.0
+    angle = math.radians(heading_deg + turned_deg)
     along = east * math.sin(angle) + north * math.cos(angle)
     return Sweep(along, math.radians(rate_deg_s), math.hypot(east, north))
 

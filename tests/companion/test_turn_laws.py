@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -188,7 +189,7 @@ def test_a_valve_is_dosed_by_the_speed_that_it_has_then(
     then_deg_s = rate_deg_s + gain_deg_s2 * YAW_FADE_S * (1.0 - math.exp(-ahead_s / YAW_FADE_S))
     nose = math.radians(heading_deg + turned_deg)
     spin = math.radians(then_deg_s)
-    sweep = sweep_at(state, ahead_s)
+    sweep = sweep_at(replace(state, mode="LOITER"), ahead_s)
     east, north = state.velocity_east_m_s, state.velocity_north_m_s
     along = east * math.sin(nose) + north * math.cos(nose)
     # Clockwise from north: a place to the right goes back, and so does the nose's own way.
@@ -198,6 +199,25 @@ def test_a_valve_is_dosed_by_the_speed_that_it_has_then(
     for found, each in zip(sweep.of(BOOM), wanted, strict=True):
         assert found == pytest.approx(max(each, 0.0), abs=0.01) or abs(max(wanted)) < 0.01
     assert sweep.speed_m_s == pytest.approx(speed_m_s)
+
+
+@pytest.mark.parametrize(
+    ("mode", "heading_deg", "ends"),
+    [("AUTO", 80.0, True), ("LOITER", 80.0, False), ("AUTO", 60.0, False), ("AUTO", 91.0, False)],
+)
+def test_in_a_mission_a_turn_ends_where_the_nose_meets_the_course(
+    mode: str, heading_deg: float, ends: bool
+) -> None:
+    state = flying(10.0, 0.0, heading_deg=heading_deg, yaw_rate_deg_s=60.0, mode=mode)
+    east_m_s = state.velocity_east_m_s
+    sweep = sweep_at(state, 0.3)
+    if ends:
+        assert sweep.along_m_s == pytest.approx(east_m_s)
+        assert sweep.yaw_rad_s == 0.0
+    else:
+        nose = math.radians(heading_deg + 18.0)
+        assert sweep.along_m_s == pytest.approx(east_m_s * math.sin(nose))
+        assert sweep.yaw_rad_s == pytest.approx(math.radians(60.0))
 
 
 @pytest.mark.parametrize(("gain_deg_s2", "opens"), [(40.0, False), (-40.0, True)])
