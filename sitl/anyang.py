@@ -134,7 +134,7 @@ def anyang_items(speed_m_s: float) -> tuple[MissionItem, ...]:
 def anyang_lag(output: str, folder: Path = EXAMPLE / "lags") -> LagModel:
     """Return the lags measured beforehand for an output path: `gpio` or `servo`.
 
-    Made by `sitl/studies/measure_lags.py`, on other sprayers of the make than any flight's.
+    Made by `tools/studies/measure_lags.py`, on other sprayers of the make than any flight's.
     """
     path = folder / f"{output}.toml"
     try:

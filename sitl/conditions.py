@@ -5,7 +5,7 @@ along and across the centre line of a `CentreLine`, so that one map serves a str
 arc.
 
 Unknown errors of lags act on the configuration, of position on the messages, wind on where the
-liquid lands. A campaign sets them as `error.`; what they cost is in `sitl/studies/sensitivity.py`.
+liquid lands. A campaign sets them as `error.`; what they cost is in `tools/studies/sensitivity.py`.
 """
 
 from __future__ import annotations

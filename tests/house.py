@@ -158,7 +158,6 @@ def findings(root: Path = ROOT) -> list[str]:
         if not by[name] - {name}
         and name not in doors
         and path.name not in ("__init__.py", "__main__.py")
-        and not name.startswith("sitl.studies.")  # run by themselves: python -m ...
     ]
     return unused + private_imports(files) + long_functions(files)
 

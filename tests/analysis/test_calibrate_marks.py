@@ -20,7 +20,7 @@ from analysis.csv_rows import TableError
 from analysis.marks import Mark, MarksFit, fit_marks, missing_in
 from analysis.student import t_factor, t_inside
 from sitl.flight import MESSAGE_DELAY_S
-from sitl.studies.marks import Trial, csv_of, lay_marks
+from tools.studies.marks import Trial, csv_of, lay_marks
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "anyang" / "config.toml"
 TO_AND_FRO = (30.0, 210.0)

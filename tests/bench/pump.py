@@ -1,7 +1,7 @@
 """Lag distances of a sprayer whose pump makes the flow: `python -m tests.bench.pump [SEED…]`.
 
 Two passes over zones of 60 m, rate steps of 30 % of the rate before, gusts of 1 m/s, noise of the
-position, lags measured beforehand on the rig (`python -m sitl.studies.measure_pump`). In the same
+position, lags measured beforehand on the rig (`python -m tools.studies.measure_pump`). In the same
 run the controller of Wang et al. 2024 without look-ahead, with its own, and with one tuned to this
 pump.
 """
@@ -26,11 +26,11 @@ from companion.core.types import Method
 from sitl.flight import FlightOptions, fly
 from sitl.knowledge import boom, measured_sets, pwm_limits
 from sitl.profile import PlantProfile, load_profile
-from sitl.studies.measure_pump import measure
 from sitl.trajectory import Trajectory
 from sitl.vehicle import Leg, Route, Vehicle
 from sitl.wang import LOOK_AHEAD_S, PROGRAM_S, WangController, curve_duties
 from tests.bench.figures import Figure
+from tools.studies.measure_pump import measure
 
 SEEDS = (1, 2, 3, 4, 5)
 SPEED_M_S = 5.0

@@ -25,11 +25,11 @@ from missions.maps.compiling import compiled_setup
 from sitl.flight import FlightOptions, fly
 from sitl.knowledge import lags as true_lags
 from sitl.profile import load_profile
-from sitl.studies.droplets import TRUTHS, Air, fall, landed, law, shift_of, spectrum_um, with_wind
 from sitl.trajectory import Leg
 from sitl.trajectory import Route as SimulatedRoute
 from sitl.vehicle import Vehicle
 from tests.builders import SPRAYING, along, flying, position, setup
+from tools.studies.droplets import TRUTHS, Air, fall, landed, law, shift_of, spectrum_um, with_wind
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "anyang" / "config.toml"

@@ -28,9 +28,9 @@ from sitl.knowledge import lags, measured_sets, pwm_limits
 from sitl.plant import AveragedPlant, PulsedPlant
 from sitl.plants import PumpFlow, PumpPlant
 from sitl.profile import ML_S_PER_L_MIN, PlantProfile, flow_table, load_profile
-from sitl.studies.measure_pump import measure
 from tests.bench.pump import SPEED_M_S, TUNED_S, flights, path, setup
 from tests.builders import flying
+from tools.studies.measure_pump import measure
 
 PINPOINT, PUMP = load_profile("pinpoint"), load_profile("pump")
 assert PUMP.pump is not None

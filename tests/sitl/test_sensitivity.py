@@ -15,7 +15,8 @@ from companion.errors import ConfigError
 from sitl.anyang import anyang_lag, demo_setup
 from sitl.campaign.design import read_campaign
 from sitl.conditions import BORDER, INSIDE, Disturbance, displaced, on_ground, shortened
-from sitl.studies.sensitivity import (
+from tests.sitl.campaign_files import fly_here
+from tools.studies.sensitivity import (
     Cost,
     Figures,
     Result,
@@ -25,7 +26,6 @@ from sitl.studies.sensitivity import (
     write_page,
     write_plot,
 )
-from tests.sitl.campaign_files import fly_here
 
 CAMPAIGN = Path(__file__).parents[2] / "examples" / "campaigns" / "sensitivity.toml"
 FLOWN = (
@@ -91,7 +91,7 @@ def test_page_and_picture_hold_what_was_measured(result: Result, tmp_path: Path)
     write_plot(result, plot)
     write_page(result, page, plot=plot)
     text = page.read_text(encoding="utf-8")
-    assert "python -m sitl.studies.sensitivity" in text
+    assert "python -m tools.studies.sensitivity" in text
     assert "(plot.png)" in text
     assert all(f"| {row.label} |" in text for row in result.rows)
     assert plot.read_bytes().startswith(b"\x89PNG")

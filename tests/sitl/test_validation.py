@@ -33,8 +33,9 @@ from sitl.campaign.flying import fly_flight
 from sitl.demo import PROFILE
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile
-from sitl.studies import validation, validation_flights
-from sitl.studies.validation_flights import (
+from tests.sitl.campaign_files import fly_here
+from tools.studies import validation, validation_flights
+from tools.studies.validation_flights import (
     BOUND_M,
     BOUND_METHODS,
     EVERY_WAY,
@@ -46,7 +47,6 @@ from sitl.studies.validation_flights import (
     pooled,
     validate,
 )
-from tests.sitl.campaign_files import fly_here
 
 CAMPAIGN = Path(__file__).parents[2] / "examples" / "campaigns" / "validation.toml"
 SEEDS = (4, 5)
@@ -220,13 +220,13 @@ def test_page_and_pictures_show_every_method_beside_the_published(
 ) -> None:
     validation.check_folder(tmp_path)
     validation.write_all(
-        full(result), tmp_path, command="python -m sitl.studies.validation --seeds 2"
+        full(result), tmp_path, command="python -m tools.studies.validation --seeds 2"
     )
     page = (tmp_path / "validation.md").read_text(encoding="utf-8")
     for way in EVERY_WAY:
         tables = 4 if way.method == "look-ahead" else 3
         assert page.count(f"| {way.name} |") == tables * len(SPEEDS_M_S)
-    assert "Made by `python -m sitl.studies.validation --seeds 2`" in page
+    assert "Made by `python -m tools.studies.validation --seeds 2`" in page
     assert "| 3.87 | 3.50 to 4.30 |" in page and "| 0.32 | -0.27 to 0.78 |" in page
     for published in P1_SPRAYING_ACCURACY_PERCENT.values():
         assert " | ".join(f"{cell:.2f}" for cell in published) in page

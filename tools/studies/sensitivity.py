@@ -1,7 +1,7 @@
 """What an error that nobody knows of costs: of lag, of position, of its rate, of wind.
 
     vrspray campaign examples/campaigns/sensitivity.toml --out flown
-    python -m sitl.studies.sensitivity flown --page docs/measurements/sensitivity.md
+    python -m tools.studies.sensitivity flown --page docs/measurements/sensitivity.md
 
 compares the cases of a campaign with its first one, flights of the same seed with each other. Of
 wind: where the liquid lands is moved by wind x fall time, 0.80 s for ballistic droplets of 250 um
@@ -27,7 +27,7 @@ from companion.cli.answer import AsJson, answer
 from companion.errors import ConfigError, VrsprayError
 from companion.wording import install_command
 from sitl.campaign.dataset import read_columns, read_manifest
-from sitl.studies import run_study
+from tools.studies import run_study
 
 # Figures by their columns in a campaign's dataset.
 COLUMNS = {
@@ -163,7 +163,7 @@ def result_of(folder: Path) -> Result:
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
-@app.command(epilog="Example: python -m sitl.studies.sensitivity flown --page sensitivity.md")
+@app.command(epilog="Example: python -m tools.studies.sensitivity flown --page sensitivity.md")
 def sensitivity(
     flown: Annotated[Path, typer.Argument(metavar="DIR", help="Dataset of the campaign.")],
     page: Annotated[Path | None, typer.Option(metavar="MD", help="Write the page.")] = None,
@@ -187,14 +187,14 @@ def main() -> int:
 
 # How the costs of errors are shown: lines for a terminal, a page, a picture.
 
-COMMAND = "python -m sitl.studies.sensitivity"
+COMMAND = "python -m tools.studies.sensitivity"
 HEAD = (
     "Disturbance", "Lag mean [m]", "Abs [m]", "Cost [m]", "Worst [m]", "Cost [m]",
     "Misapplied [%]", "Cost [points]", "Outside [mL]",
 )  # fmt: skip
 
 INTRODUCTION = """\
-<!-- Written by `python -m sitl.studies.sensitivity`; do not edit. -->
+<!-- Written by `python -m tools.studies.sensitivity`; do not edit. -->
 
 # Sensitivity
 

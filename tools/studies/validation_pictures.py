@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from analysis.published import P1_RATES_L_HA, P1_SPRAYING_ACCURACY_PERCENT
 from companion.errors import ConfigError
 from sitl.demo_pictures import COLOURS, DPI, INK, QUIET, STYLE, TITLES, new_figure
-from sitl.studies.validation_flights import WAYS, FlownMethod, Row, Validation, basis, mean_of
+from tools.studies.validation_flights import WAYS, FlownMethod, Row, Validation, basis, mean_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

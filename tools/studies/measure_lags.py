@@ -1,6 +1,6 @@
 """Measures a sprayer's lags on the twin, beforehand, as rig and marked flights would.
 
-    python -m sitl.studies.measure_lags examples/anyang/config.toml [--output servo]
+    python -m tools.studies.measure_lags examples/anyang/config.toml [--output servo]
 
 prints the `[lag]` table to paste. On the rig each valve goes on, up, down and off many times at
 any phase of its period; what was ordered is compared with the volume that came. What no rig sees,
@@ -152,7 +152,7 @@ def measure(setup: Setup, profile: PlantProfile, options: FlightOptions) -> LagM
 def main(arguments: Sequence[str]) -> int:
     """Print the `[lag]` table of a configuration's sprayer."""
     parser = argparse.ArgumentParser(
-        prog="python -m sitl.studies.measure_lags", description=__doc__
+        prog="python -m tools.studies.measure_lags", description=__doc__
     )
     parser.add_argument("config", type=Path)
     parser.add_argument("--plant", default="wang-2024")
@@ -165,7 +165,7 @@ def main(arguments: Sequence[str]) -> int:
     setup = replace(setup, lag=replace(setup.lag, output_s=path_s))
     lag = measure(setup, profile, FlightOptions(output=given.output))
     sys.stdout.write(
-        f"# {given.plant}, {given.output}: `python -m sitl.studies.measure_lags {given.config} "
+        f"# {given.plant}, {given.output}: `python -m tools.studies.measure_lags {given.config} "
         f"--plant {given.plant} --output {given.output}`\n"
     )
     names = ("on_s", "off_s", "up_s", "down_s", "on_start_s", "off_end_s", "output_s")

@@ -1,6 +1,6 @@
 """The twin lays marks: a boundary flown to and fro at two speeds, errors unknown to the controller.
 
-    python -m sitl.studies.marks --flights 100 [--fidelity averaged] [--body 0.3] [--datum 0.8,-0.5]
+    python -m tools.studies.marks --flights 99 [--fidelity averaged] [--body 0.3] [--datum 0.8,-0.5]
 
 flies so many seeds and prints how often the marks' intervals hold the truth. `--csv FILE` writes
 the marks of one flight as a person would. The controller has position_s = 0, its boom where the
@@ -205,7 +205,7 @@ def score(fit: MarksFit, trial: Trial, position_s: float) -> Score:
 
 def main(arguments: Sequence[str]) -> int:
     """Fly a campaign and print a line for each quantity."""
-    parser = argparse.ArgumentParser(prog="python -m sitl.studies.marks", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tools.studies.marks", description=__doc__)
     parser.add_argument("--flights", type=int, default=20)
     parser.add_argument("--first-seed", type=int, default=1)
     parser.add_argument("--fidelity", choices=("averaged", "pulsed"), default="pulsed")

@@ -1,7 +1,7 @@
 """The twin against what Wang et al. 2024 (P1) measured with a real sprayer.
 
     vrspray campaign examples/campaigns/validation.toml --out flown
-    python -m sitl.studies.validation flown --out docs/measurements
+    python -m tools.studies.validation flown --out docs/measurements
 
 P1's controller (`sitl/wang.py`, which doses by P1's Eq. 2) flies over P1's field at P1's speeds,
 without compensation and with both look-aheads, and then the same flights with `scheduled`. The
@@ -270,12 +270,12 @@ def validate(folder: Path) -> Validation:
     )
 
 
-COMMAND = "python -m sitl.studies.validation"
+COMMAND = "python -m tools.studies.validation"
 SET_CHANGE_L_MIN = 4.0
 Table = list[tuple[str, ...]]
 
 INTRODUCTION = """\
-<!-- Written by `python -m sitl.studies.validation`; do not edit. -->
+<!-- Written by `python -m tools.studies.validation`; do not edit. -->
 
 # Validation against Wang et al. 2024
 

@@ -1,6 +1,6 @@
 """Where the deposit lands in wind, with and without the controller's offset: the check of it.
 
-    python -m sitl.studies.droplets
+    python -m tools.studies.droplets
 
 The first table compares the controller's offset with ballistic droplets
 that fall as assumed, and otherwise. The second flies the field of Wang et al. 2024 with and
@@ -276,7 +276,7 @@ def tables(shifts: Iterable[Shift], grounds: Iterable[Ground]) -> Iterator[str]:
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
-@app.command(epilog="Example: python -m sitl.studies.droplets --seeds 3")
+@app.command(epilog="Example: python -m tools.studies.droplets --seeds 3")
 def droplets(
     seeds: Annotated[int, typer.Option(min=0, max=100, help="Flights of seeds 1 to N.")] = 3,
     averaged: Annotated[

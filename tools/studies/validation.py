@@ -1,7 +1,7 @@
 """The twin against what Wang et al. 2024 (P1) measured with a real sprayer, as a command.
 
     vrspray campaign examples/campaigns/validation.toml --out flown
-    python -m sitl.studies.validation flown --out docs/measurements
+    python -m tools.studies.validation flown --out docs/measurements
 
 `validation_flights` reads the flights, `validation_pictures` shows them.
 """
@@ -19,15 +19,21 @@ import typer
 from companion.cli.answer import AsJson, answer
 from companion.errors import ConfigError, VrsprayError
 from companion.wording import install_command
-from sitl.studies import run_study
-from sitl.studies.validation_flights import COMMAND, Validation, summary_lines, validate, write_page
+from tools.studies import run_study
+from tools.studies.validation_flights import (
+    COMMAND,
+    Validation,
+    summary_lines,
+    validate,
+    write_page,
+)
 
 IMAGES = "images"
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
-@app.command(epilog="Example: python -m sitl.studies.validation flown --out docs/measurements")
+@app.command(epilog="Example: python -m tools.studies.validation flown --out docs/measurements")
 def validation(
     flown: Annotated[Path, typer.Argument(metavar="DIR", help="Dataset of the campaign.")],
     out: Annotated[
@@ -69,7 +75,7 @@ def check_folder(folder: Path) -> None:
 
 def write_all(result: Validation, folder: Path, *, command: str) -> None:
     """Write the page and its pictures."""
-    from sitl.studies.validation_pictures import draw_pictures
+    from tools.studies.validation_pictures import draw_pictures
 
     names = draw_pictures(result, folder / IMAGES)
     write_page(result, folder, pictures=[f"{IMAGES}/{name}" for name in names], command=command)

@@ -1,6 +1,6 @@
 """What no controller can do better on this twin: how well a speed can be foretold at all.
 
-    python -m sitl.studies.physical_limit
+    python -m tools.studies.physical_limit
 
 A trim acts a lag and half a period after its order. Until then gusts change the speed, and the
 velocity that is heard has noise. The best that any linear filter can do follows from the gusts'

@@ -1,12 +1,12 @@
 """Measures the lags of a sprayer whose pump makes the flow, on the twin, as a rig would.
 
-    python -m sitl.studies.measure_pump [PLANT]
+    python -m tools.studies.measure_pump [PLANT]
 
 prints the `[lag]` table to paste, and `[pump]` where the pump has an order of its own. Steps of
 30 % up and down, each left alone until the flow stands; with valves, the boom opened and shut at a
 flow that stands. What was ordered is compared with the volume that came. The position's age is no
-matter of the sprayer: it is that of `python -m sitl.studies.measure_lags`, for any plant behind the
-same autopilot.
+matter of the sprayer: it is that of `python -m tools.studies.measure_lags`, for any plant behind
+the same autopilot.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ def main(arguments: Sequence[str]) -> int:
     """Print the `[lag]` table of a plant."""
     name = arguments[0] if arguments else "pump"
     profile = load_profile(name)
-    sys.stdout.write(f"# {name}: `python -m sitl.studies.measure_pump {name}`\n")
+    sys.stdout.write(f"# {name}: `python -m tools.studies.measure_pump {name}`\n")
     names: tuple[str, ...] = ("on_s", "off_s", "up_s", "down_s", "on_start_s", "off_end_s")
     names = (*names, "output_s", "position_s")
     lag = pump = None
