@@ -173,8 +173,6 @@ class GuardedServoExecutor(ServoExecutor):
                 return
             self._silent_s = 0.0
             closings, is_closing, why = json.loads(packet)
-            if is_closing != self._is_closing or closings != self._closings:
-                self._sent_us = [None] * len(self._outputs)
             if closings > self._closings > 0:
                 self._say(f"guardian closed all: {why}")
             self._closings, self._is_closing = closings, is_closing

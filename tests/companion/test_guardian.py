@@ -244,6 +244,7 @@ def test_a_serial_line_that_stopped_in_mid_frame_is_closed_all_the_same(length: 
         while len(frames(data)) < len(VALVES) and len(data) < 2 * len(PAD):
             data += one.sent(LEASE_S)
         assert closed(frames(data)[: len(VALVES)]) == VALVES
+        assert data[length:].startswith(PAD)
 
 
 def test_datagrams_go_to_every_peer_and_to_the_one_other_end() -> None:
