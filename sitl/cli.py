@@ -228,7 +228,7 @@ def fly(
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
 ) -> None:
-    """Simulate a mission in closed loop, and evaluate it; or fly along a log of your own.
+    """Simulate a mission in closed loop, or fly along a log of your own.
 
     Faster than real time.
 
