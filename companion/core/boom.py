@@ -125,6 +125,8 @@ STRAIGHT_LATERAL_M_S2 = 1.0
 # the boom's middle does now. At 5 m/s 0.3 m/s2 turn the course by 1 degree in 0.3 s.
 STEADY_YAW_RATE_DEG_S = 1.0
 STEADY_LATERAL_M_S2 = 0.3
+# Two velocities have one course, 2 degrees apart at most (a sine).
+SAME_COURSE = 0.035
 # Knots of a path nearer than this are one.
 KNOTS_APART_S = 1e-3
 # In a turn a chord is so long, or this share of how far ahead it begins; leads nearer than
@@ -325,7 +327,7 @@ def _knots(back_s: float, ahead_s: float, leads_s: tuple[float, ...]) -> tuple[f
     """Return the knots of a path in a turn: now, at each lead, and the denser the sooner.
 
     >>> [round(at_s, 2) for at_s in _knots(0.2, 1.0, (0.12, 0.13))]
-    [-0.2, 0.0, 0.06, 0.12, 0.2, 0.29, 0.45, 0.72, 1.0]
+    [-0.2, 0.0, 0.06, 0.12, 0.21, 0.34, 0.54, 0.77, 1.0]
     """
     found = [-back_s, 0.0]
     for due_s in (*sorted(lead_s for lead_s in leads_s if lead_s < ahead_s), ahead_s):
@@ -423,8 +425,9 @@ def sweep_at(state: VehicleState, dt_s: float) -> Sweep:
         state, dt_s, state.acceleration_east_m_s2, state.acceleration_north_m_s2
     )
     heading_deg = state.heading_deg or 0.0
-    if state.mode in MISSION_MODES:
-        # A mission turns the nose to its course, and no farther.
+    across = state.velocity_east_m_s * north - state.velocity_north_m_s * east
+    if state.mode in MISSION_MODES and abs(across) <= SAME_COURSE * (east * east + north * north):
+        # A mission turns the nose to its course, and no farther; not while the course turns, too.
         to_course_deg = (course_deg(east, north) - heading_deg + 180.0) % 360.0 - 180.0
         if turned_deg * to_course_deg > 0.0 and abs(turned_deg) > abs(to_course_deg):
             turned_deg, rate_deg_s = to_course_deg, 0.0

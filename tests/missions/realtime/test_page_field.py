@@ -307,7 +307,7 @@ async def test_a_field_is_drawn_zoned_planned_flown_stopped_continued_and_report
         day = Day(bench, page, f"http://127.0.0.1:{port}/")
         day.watch()
         async with companion_of(bench, *web):
-            await bench.until(lambda: "link up" in bench.said, within_s=60.0)
+            await bench.until(lambda: "operator's page:" in bench.said, within_s=60.0)
             await day.draw_and_make(samples, corners(two_zones()))
             await plan_and_upload(page)
             settings = await settings_told(page)
@@ -323,7 +323,7 @@ async def test_a_field_is_drawn_zoned_planned_flown_stopped_continued_and_report
         limits = tmp_path / "limits.toml"
         limits.write_text(LIMITS)
         async with companion_of(bench, *web, *settings, f'limits.file="{limits}"'):
-            await bench.until(lambda: "link up" in bench.said, within_s=60.0)
+            await bench.until(lambda: "operator's page:" in bench.said, within_s=60.0)
             await day.open()
             await day.declare()
             await day.take_off()

@@ -125,7 +125,7 @@ def _is_as_shown(text: str, said: str) -> None:
     if shown is None or "sh" in after[: shown.start(1)].split("```")[0].split():
         return
     if "demo" in text:
-        assert re.search(r"0\.05\d m \(worst 0\.1\d m\)", said), said
+        assert re.search(r"0\.0[45]\d m \(worst 0\.1\d m\)", said), said
         return
     assert shown[1].strip() in said, said
 

@@ -73,7 +73,7 @@ async def test_a_flight_ends_with_the_truth_on_disk(tmp_path: Path) -> None:
     async with udp_client(local=port) as client:
         process = await start(
             *("--link", f"udpout:127.0.0.1:{port}"),
-            *("--mission", str(mission), "--out", str(out), "--speed", "10"),
+            *("--mission", str(mission), "--out", str(out), "--speed", "10", "--no-script"),
         )
         await play_companion(client)
         code, stdout, stderr = await ended(process)
