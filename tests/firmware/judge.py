@@ -371,11 +371,20 @@ def judge_perfect(
     return _verdict(path, 0.1 * np.array(flows), plane, zones, inside, lines, sprayer, grazing_m)
 
 
-def apart_m(verdict: Verdict, other: Verdict) -> Floats:
-    """Return how far the changes of two verdicts of one flight are apart, those that both have."""
+def apart_m(verdict: Verdict, other: Verdict) -> tuple[Floats, Floats]:
+    """Return how far the changes of two verdicts of one flight are apart, those that both have.
+
+    And as metres of the greater dose: a change by a seventh that lies 0.28 m off puts as much in
+    the wrong place as one from nothing that lies 0.04 m off.
+    """
     lags_m = {(one.valve, one.at_s): one.lag_m for one in other.changes}
-    pairs = [(one.lag_m, lags_m.get((one.valve, one.at_s))) for one in verdict.changes]
-    return np.array([a - b for a, b in pairs if a is not None and b is not None])
+    rows = [
+        (one.lag_m - lag_m, abs(one.to_l_ha - one.from_l_ha) / max(one.to_l_ha, one.from_l_ha))
+        for one in verdict.changes
+        if one.lag_m is not None and (lag_m := lags_m.get((one.valve, one.at_s))) is not None
+    ]
+    found_m, steps = np.array(rows).reshape(-1, 2).T
+    return found_m, np.abs(found_m) * steps
 
 
 def _plane(zones: Sequence[Zone]) -> Plane:

@@ -124,9 +124,12 @@ def test_a_perfect_sprayer_is_off_by_what_place_and_speed_disagree_by() -> None:
     # 3 % for half a second each way, with changes of 17 and 60 %.
     swinging = judge_perfect(told_speed(5.0, wiggle_m_s=0.15), zones)
     assert 0.02 < swinging.mean_abs_m < 0.3
-    off_m = apart_m(swinging, steady)
+    off_m, dose_m = apart_m(swinging, steady)
     assert off_m == pytest.approx(swinging.lags_m - steady.lags_m)
-    assert apart_m(steady, judge_perfect(told_speed(5.0), zones[:2])).shape == (6,)
+    for one, apart, dose in zip(steady.changes, off_m, dose_m, strict=True):
+        greater, lesser = sorted((one.from_l_ha, one.to_l_ha), reverse=True)
+        assert dose == pytest.approx(abs(apart) * (1.0 - lesser / greater))
+    assert apart_m(steady, judge_perfect(told_speed(5.0), zones[:2]))[0].shape == (6,)
 
 
 def test_a_change_that_never_came_is_missed() -> None:
