@@ -54,8 +54,12 @@ def write_result(
 
 
 def truth_arrays(flown: Flown) -> dict[str, Any]:
-    """Return the true flight as arrays; metres are in the frame that the journal names."""
+    """Return the true flight as arrays; metres are east and north of `origin_deg`.
+
+    With the valves' strips in it the file says by itself what fell where.
+    """
     record, orders = flown.result.record, flown.result.record.orders
+    frame, valves = flown.task.setup.frame, record.boom.valves
     path = flown.trajectory.at(record.time_s)
     return _motor_arrays(flown) | {
         "time_s": record.time_s,
@@ -69,6 +73,10 @@ def truth_arrays(flown: Flown) -> dict[str, Any]:
         "order_time_s": np.array([order.at_s for order in orders], dtype=np.float64),
         "order_valve": np.array([order.valve for order in orders], dtype=np.int64),
         "order_duty": np.array([order.duty for order in orders], dtype=np.float64),
+        "origin_deg": np.array([frame.latitude_deg, frame.longitude_deg]),
+        "right_m": np.array([valve.right_m for valve in valves]),
+        "forward_m": np.array([valve.forward_m for valve in valves]),
+        "width_m": np.array([valve.width_m for valve in valves]),
     }
 
 
