@@ -108,6 +108,10 @@ class Ground:
         return int(json.loads(answer.fields_json)["result"])
 
 
+def has_started(beat: dict[str, Any]) -> bool:
+    return bool(beat["system_status"] != dialect.MAV_STATE_BOOT)
+
+
 @asynccontextmanager
 async def ground(bench: Bench) -> AsyncIterator[Ground]:
     """Connect MAVSDK to the link of the bench, with both components discovered."""
@@ -122,7 +126,8 @@ async def ground(bench: Bench) -> AsyncIterator[Ground]:
         found = Ground(system)
         listening = asyncio.create_task(found.listen())
         try:
-            await found.until(lambda: bool(found.of("HEARTBEAT")))
+            # Where the companion calls the vehicle it is heard while it still reads its map.
+            await found.until(lambda: any(map(has_started, found.of("HEARTBEAT"))))
             yield found
         finally:
             listening.cancel()

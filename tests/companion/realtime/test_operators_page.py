@@ -22,6 +22,7 @@ from urllib.parse import urlsplit
 import pytest
 from axe_playwright_python.async_playwright import Axe
 from playwright.async_api import Browser, Locator, Page, async_playwright, expect
+from playwright.async_api import TimeoutError as PlaywrightTimeout
 
 from companion.cli.web_parts import Watched, obeying
 from companion.doctor.check import Status
@@ -91,10 +92,14 @@ class Flight:
 
 
 async def shows(page: Page, state: str) -> None:
-    """Wait until the page says so."""
-    await page.wait_for_function(
-        "(state) => document.getElementById('state').dataset.state === state", arg=state
-    )
+    """Wait until the page says so; else tell what it says instead, with its reasons."""
+    try:
+        await page.wait_for_function(
+            "(state) => document.getElementById('state').dataset.state === state", arg=state
+        )
+    except PlaywrightTimeout:
+        said = [await page.locator(place).inner_text() for place in ("#state", "#alarms")]
+        pytest.fail(f"no {state!r}; the page says {said}")
 
 
 @pytest.fixture

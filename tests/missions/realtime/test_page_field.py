@@ -73,6 +73,8 @@ def write_maps(folder: Path, zones: Iterable[tuple[Box, float]]) -> tuple[Path, 
     shutil.copy(EXAMPLE / "config.toml", folder)
     config = folder / "config.toml"
     text = config.read_text().replace('"prescription.shp"', '"prescription.geojson"\nunit = "L/ha"')
+    # No script runs on this stub, and no board is behind it.
+    text = text.replace('kind = "servo"', 'kind = "servo"\nguard = "none-on-power-loss"')
     # A strict border would keep the outer valves shut where the position's noise is over it.
     config.write_text(text.replace('border = "inside"', 'border = "volume"'))
     rated = [(shapely.box(*box), {"rate": rate}) for box, rate in zones]
