@@ -109,6 +109,8 @@ class Announcer:
         self._said_s = self._seen_s = float("-inf")
         self._waiting: deque[tuple[int, str]] = deque(maxlen=_WAITING_MAX)
         self._noted_s = float("-inf")
+        # Until something has left nobody is told anything: what is said then would be lost.
+        self.is_reached = False
         self.tank_l: float | None = None
 
     def fault(self, text: str) -> None:
@@ -144,13 +146,14 @@ class Announcer:
         if decision is None:
             return
         self._tally.take(decision)
-        yield from self._text(decision, now_s)
+        if self.is_reached:
+            yield from self._text(decision, now_s)
         if self._values.is_due(now_s):
             yield from self.named_values(decision, now_s)
 
     def _notes(self, now_s: float) -> Iterator[bytes]:
         """Yield faults at once, and of the rest one in every tenth of a second."""
-        while self._waiting and (
+        while (self.is_reached and self._waiting) and (
             self._waiting[0][0] == _ERROR or not now_s - self._noted_s < LIVE_S
         ):
             severity, text = self._waiting.popleft()

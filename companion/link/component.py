@@ -334,6 +334,7 @@ class Component:
 
     def _send(self, frame: bytes) -> bool:
         has_left = self._transport_send(frame)
+        self._announcer.is_reached |= has_left
         self.meter.sent(len(frame), has_left=has_left)
         return has_left
 

@@ -47,6 +47,7 @@ _logger = logging.getLogger(__name__)
 
 _EARLY_MAX, _KEPT_MAX = 512, 50_000
 _STATISTICS_S = 60.0
+_DOWN = "link is down"
 # A turn reads no longer than this and a slice: what else is due comes between.
 _READ_S = 0.001
 _SAMPLE_S = 1.0
@@ -98,7 +99,7 @@ class VehicleLink:
         closed, and the vehicle has been heard: nothing opens on what was known before.
         """
         if self._transport is None or not self._transport.is_up:
-            return "link is down"
+            return _DOWN
         if not (self._heard and self._told):
             return "link is reconnecting"
         finding = blocking(self.component.codec.census, self._clock())
@@ -241,7 +242,9 @@ class VehicleLink:
         self._keep_count(now_s)
 
     def tell_fault(self, text: str) -> None:
-        """Tell the operator once of something that does not work."""
+        """Tell the operator once of something that does not work; a link that is down cannot."""
+        if text == _DOWN:
+            return
         finding = blocking(self.component.codec.census, self._clock())
         is_that = finding is not None and finding.text == text
         self.component.fault(finding.short if finding is not None and is_that else text)

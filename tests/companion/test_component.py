@@ -33,6 +33,23 @@ def test_the_heartbeat_goes_on_once_a_second_however_often_the_loop_turns(
     assert len(peer.of("HEARTBEAT")) == 10
 
 
+def test_what_is_said_before_anybody_hears_it_is_told_to_the_first_who_does(
+    peer: Peer, component: Component
+) -> None:
+    peer.is_up = False
+    component.warn("last run was killed")
+    component.fault("no guardian")
+    for turn in range(20):
+        component.tick(CLOSED, 100.0 + turn * 0.06)
+    peer.is_up = True
+    component.receive(peer.heartbeat(), 101.2)
+    for turn in range(20):
+        component.tick(CLOSED, 101.2 + turn * 0.06)
+    told = peer.texts()
+    assert told[:2] == ["Spray: last run was killed", "Spray: no guardian"]
+    assert [text[:9] for text in told[2:]] == ["Spray off"]
+
+
 def test_without_the_loop_there_is_no_heartbeat(peer: Peer, component: Component) -> None:
     component.tick(CLOSED, 0.0)
     peer.sent.clear()
