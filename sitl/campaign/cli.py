@@ -221,7 +221,9 @@ def _lines(dataset: Dataset, tally: Tally | None) -> Iterator[str]:
     yield f"dataset: {dataset.folder}; see it with: vrspray campaign show {dataset.folder}"
 
 
-@app.command(epilog="Example: vrspray campaign show lags --by config.lag.up_s --plots pictures")
+@app.command(
+    epilog="Example: vrspray campaign show lags --by case --by config.lag.up_s --out table.csv"
+)
 def show(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a campaign's dataset.")],
     figure: Annotated[
@@ -229,34 +231,49 @@ def show(
         typer.Option(metavar="NAME", help="Figure to show; repeatable. Default: five."),
     ] = None,
     by: Annotated[
-        str | None,
-        typer.Option(metavar="SETTING", help="This setting, or `case`. Default: all varied."),
+        list[str] | None,
+        typer.Option(
+            metavar="SETTING", help="This setting, or `case`; repeatable. Default: all varied."
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write the tables: .csv, .tex or .parquet."),
     ] = None,
     plots: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Draw the pictures into this folder.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show each figure by setting, and which settings matter.
+    """Show each figure by setting, what cases differ by, and which settings matter.
+
+    Intervals are over the seeds. Differences are from the first case, or from the first value of
+    the first --by, each over pairs of one seed.
 
     Exit 0: shown; 2: the folder or an option is wrong.
     """
     from sitl.campaign.show import (
         SHOWN,
+        differences_of,
         groups_of,
         lines_of,
         notes_of,
         read_rows,
         sensitivity_lines,
         sensitivity_of,
+        write_tables,
     )
     from sitl.campaign.show import as_json as shown_json
 
     rows = read_rows(folder, tuple(dict.fromkeys(figure or SHOWN)))
-    groups, found = groups_of(rows, by=by), sensitivity_of(rows)
+    groups, found = groups_of(rows, by or ()), sensitivity_of(rows)
+    differences = differences_of(rows, by or ())
     notes = list(notes_of(rows, found))
-    result = {**shown_json(rows, groups, found), "notes": notes}
-    lines = [*lines_of(rows, groups), *sensitivity_lines(found), *notes]
+    result = {**shown_json(rows, groups, differences, found), "notes": notes}
+    lines = [*lines_of(rows, [*groups, *differences]), *sensitivity_lines(found), *notes]
+    if out is not None:
+        write_tables(out, [*groups, *differences])
+        lines.append(f"written: {out}")
     if plots is not None:
         from sitl.campaign.pictures import draw_pictures
 

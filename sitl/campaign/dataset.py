@@ -108,21 +108,24 @@ class Dataset:
 
     def write(self, part: int, rows: Sequence[Mapping[str, Any]]) -> None:
         """Write a part as a whole."""
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
         ordered = sorted(rows, key=lambda row: row["flight"])
-        table = pa.Table.from_pylist(ordered, schema=self.schema)
-        content = io.BytesIO()
-        pq.write_table(table, content, compression="zstd", compression_level=3, version="2.6")
         path = self.path_of(part)
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, content.getvalue())
+        write_atomically(path, parquet_of(arrow().Table.from_pylist(ordered, schema=self.schema)))
 
     def log(self, entry: Mapping[str, Any]) -> None:
         """Add a line on how it went."""
         with (self.folder / LOG).open("a", encoding="utf-8") as file:
             file.write(json.dumps(entry) + "\n")
+
+
+def parquet_of(table: pa.Table) -> bytes:
+    """Return a table as a file of Parquet."""
+    content = io.BytesIO()
+    arrow().parquet.write_table(
+        table, content, compression="zstd", compression_level=3, version="2.6"
+    )
+    return content.getvalue()
 
 
 def _told(value: Any) -> Any:

@@ -99,6 +99,8 @@ def _responses(rows: Rows, groups: Sequence[Group]) -> Figure | None:
             _response(axis, rows.figures[name], numeric.get(setting), of_setting, name)
             if column == 0:
                 axis.set_ylabel(_short(name), size=7)
+            if row == 0 and of_setting[0].within:
+                axis.legend(fontsize=6)
             if row < len(rows.figures) - 1:
                 axis.tick_params(labelbottom=False)
             else:
@@ -109,24 +111,28 @@ def _responses(rows: Rows, groups: Sequence[Group]) -> Figure | None:
 def _response(
     axis: Axes, values: Floats, places: Floats | None, groups: Sequence[Group], name: str
 ) -> None:
-    at: Any = range(len(groups))
+    words = list(dict.fromkeys(group.value for group in groups))
     if places is not None:
         some = slice(None, None, -(-len(values) // POINTS_MAX))
         axis.plot(places[some], values[some], ".", ms=2, color="0.75", mec="none", zorder=1)
-        at = [group.middle for group in groups]
     else:
-        axis.set_xticks(
-            list(at), [group.value for group in groups], rotation=30, ha="right", size=7
-        )
-        axis.set_xlim(-0.5, len(groups) - 0.5)
-    for x, group in zip(at, groups, strict=True):
-        found = group.figures[name]
+        axis.set_xticks(range(len(words)), words, rotation=30, ha="right", size=7)
+        axis.set_xlim(-0.5, len(words) - 0.5)
+    # Cases have a colour each, and one name in the legend.
+    series = list(dict.fromkeys(", ".join(group.within.values()) for group in groups))
+    named: set[str] = set()
+    for group in groups:
+        found, of = group.figures[name], ", ".join(group.within.values())
         if found is None:
             continue
         half = _halves([(found.low, found.mean, found.high)])
+        at: Any = words.index(group.value) if group.middle is None else group.middle
         axis.errorbar(
-            [x], [found.mean], yerr=half, fmt="o", ms=3.5, color=BLUE, capsize=2, zorder=2
-        )
+            [at], [found.mean], yerr=half, fmt="o", ms=3.5, capsize=2, zorder=2,
+            color=BLUE if len(series) == 1 else f"C{series.index(of)}",
+            label=None if of in named else of or None,
+        )  # fmt: skip
+        named.add(of)
 
 
 def _halves(ends: Sequence[tuple[float | None, float, float | None]]) -> Any:

@@ -1,8 +1,8 @@
 """What the rows of a campaign say: figures by setting, which settings matter, with intervals.
 
-The interval is Student's, 95 %. Where a group is one setting, it is over the seeds; else it is over
-the settings in the group, each with the mean of its seeds: flights of one seed share their path and
-their sprayer, and are not so many witnesses.
+Settings are chosen, seeds are drawn: a group's figure is the mean over its settings, seed by seed,
+and its 95 % interval is Student's over the seeds. Flights of one seed share path and sprayer, so
+two settings are compared seed by seed: what a seed does to both of them drops out.
 
 `sobol` designs give shares of variance, of a setting alone (S1) and with all its interactions (ST).
 `morris` designs give the mean size of its effect over the whole range (mu*), and how much that
@@ -15,16 +15,19 @@ import math
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.atomic_write import write_atomically
+from companion.csv_table import csv_of
 from companion.errors import ConfigError
 from companion.wording import install_command
-from sitl.campaign.dataset import COPY, read_columns, read_manifest
+from sitl.campaign.dataset import COPY, arrow, parquet_of, read_columns, read_manifest
 from sitl.campaign.design import (
     GRID,
     HYPERCUBE,
@@ -35,7 +38,7 @@ from sitl.campaign.design import (
     problem_of,
     read_campaign,
 )
-from sitl.campaign.flying import figure_types
+from sitl.campaign.flying import DISTANCES, figure_types
 
 Floats = NDArray[np.float64]
 SHOWN = (
@@ -47,46 +50,71 @@ VALUES_MAX, BINS = 12, 6
 CONFIDENCE = 0.95
 
 
+def least_of(figure: str) -> float:
+    """Return the least value that a figure can have, where no interval can reach below."""
+    is_signed = figure.startswith(DISTANCES) and "_abs_" not in figure
+    is_signed |= figure.endswith(("accuracy_percent", "error_percent", "bound_m"))
+    return -math.inf if is_signed and not figure.endswith("_count") else 0.0
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """A mean with its interval, which needs two values, and the range of single flights."""
+    """A mean with its interval over `seeds`, which needs two, and the range of single values."""
 
     mean: float
     low: float | None
     high: float | None
     min: float
     max: float
+    seeds: int
 
     @staticmethod
-    def of(flights: Floats, samples: Floats) -> Estimate | None:
-        """Return the mean of flights, with the interval that independent samples of it give."""
-        flights, samples = flights[~np.isnan(flights)], samples[~np.isnan(samples)]
-        if not len(flights):
+    def of(table: Floats, *, least: float = -math.inf) -> Estimate | None:
+        """Return the mean of a table: a row a setting, a column a seed, NaN where there is none.
+
+        Every seed counts with the same settings: a setting without any figure is left out, then
+        seeds that lack some; where fewer than two would be left, settings that lack some.
+        """
+        known = ~np.isnan(table)
+        table, known = table[known.any(axis=1)], known[known.any(axis=1)]
+        if not known.any():
             return None
-        mean, half = float(flights.mean()), None
-        if len(samples) > 1:
+        seeds, settings = known.all(axis=0), known.all(axis=1)
+        if seeds.sum() < 2 and settings.any():
+            seeds, table = seeds | True, table[settings]
+        samples = table[:, seeds].mean(axis=0)
+        count = len(samples)
+        mean, half = float(samples.mean()) if count else float(np.nanmean(table)), None
+        if count > 1:
             from scipy.stats import t
 
-            quantile = float(t.ppf(0.5 + 0.5 * CONFIDENCE, len(samples) - 1))
-            half = quantile * float(samples.std(ddof=1)) / math.sqrt(len(samples))
+            quantile = float(t.ppf(0.5 + 0.5 * CONFIDENCE, count - 1))
+            half = quantile * float(samples.std(ddof=1)) / math.sqrt(count)
         return Estimate(
             mean=mean,
-            low=None if half is None else mean - half,
+            low=None if half is None else max(mean - half, least),
             high=None if half is None else mean + half,
-            min=float(flights.min()),
-            max=float(flights.max()),
+            min=float(np.nanmin(table)),
+            max=float(np.nanmax(table)),
+            seeds=count,
         )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Group:
-    """Flights that have one value of a setting, or one of a range, or are one case."""
+    """Flights that have one value of a setting, or one of a range, or are one case.
+
+    `within` has what else they share. Beside those with the value `against`, its figures are
+    differences: how much more, over the same seeds and settings.
+    """
 
     setting: str
     value: str
     middle: float | None
     flights: int
     figures: dict[str, Estimate | None]
+    within: dict[str, str] = field(default_factory=dict)
+    against: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,6 +127,7 @@ class Rows:
     settings: dict[str, list[Any]]
     case: list[str]
     point: NDArray[np.int64]
+    seed: NDArray[np.int64]
     flight: NDArray[np.int64]
     errors: list[str | None]
 
@@ -131,7 +160,7 @@ def read_rows(folder: Path, figures: Sequence[str]) -> Rows:
         if name not in known:
             raise ConfigError(f"--figure {name}: choose of {', '.join(known)}")
     varied = list(manifest["varied"])
-    names = ["flight", "case", "point", "error", *varied, *figures]
+    names = ["flight", "case", "point", "seed", "error", *varied, *figures]
     table = read_columns(folder, list(dict.fromkeys(names)))
     return Rows(
         campaign=read_campaign_copy(folder),
@@ -142,6 +171,7 @@ def read_rows(folder: Path, figures: Sequence[str]) -> Rows:
         settings={name: table[name].to_pylist() for name in varied},
         case=table["case"].to_pylist(),
         point=table["point"].to_numpy(),
+        seed=table["seed"].to_numpy(),
         flight=table["flight"].to_numpy(),
         errors=table["error"].to_pylist(),
     )
@@ -152,43 +182,114 @@ def read_campaign_copy(folder: Path) -> Campaign:
     return read_campaign(folder / COPY, checked=False)
 
 
-def groups_of(rows: Rows, *, by: str | None = None) -> list[Group]:
-    """Return the groups of every case and every setting that is varied, or of one of them."""
+def groups_of(rows: Rows, by: Sequence[str] = ()) -> list[Group]:
+    """Return the groups of every case and every varied setting, or of those that are wanted.
+
+    Raises:
+        ConfigError: one is unknown.
+    """
     campaign = rows.campaign
-    wanted = [factor.name for factor in campaign.factors]
-    wanted = ["case", *wanted] if len(campaign.cases) > 1 else wanted
-    if by is not None:
+    cases = ("case",) if len(campaign.cases) > 1 else ()
+    wanted = [(*cases, factor.name) for factor in campaign.factors]
+    wanted = [cases, *wanted] if cases else wanted
+    if by:
         known = ["case", *rows.settings]
-        if by not in known:
-            raise ConfigError(f"--by {by}: choose of {', '.join(known)}")
-        wanted = [by]
+        for name in by:
+            if name not in known:
+                raise ConfigError(f"--by {name}: choose of {', '.join(known)}")
+        wanted = [tuple(dict.fromkeys(by))]
     if not wanted:
         everything = np.ones(len(rows.point), dtype=bool)
-        return [_group(rows, "campaign", campaign.name, everything)]
-    return [group for name in wanted for group in _of_setting(rows, name)]
+        return [_group(rows, everything, setting="campaign", value=campaign.name)]
+    return [
+        _group(
+            rows, chosen, setting=names[-1], value=values[-1], middle=middle,
+            within=dict(zip(names[:-1], values[:-1], strict=True)),
+        )
+        for names in wanted
+        for values, middle, chosen in _combined(rows, names)
+    ]  # fmt: skip
 
 
-def _of_setting(rows: Rows, name: str) -> Iterator[Group]:
+def differences_of(rows: Rows, by: Sequence[str] = ()) -> list[Group]:
+    """Return what each value of the first setting, by default the case, gives beyond the first."""
+    setting, *rest = dict.fromkeys(by or ["case"])
+    levels, places, _ = _levels(rows, setting)
+    columns = [rows.settings[each.name] for each in rows.campaign.factors if each.name != setting]
+    columns += [] if setting == "case" else [rows.case]
+    pairs: dict[tuple[Any, ...], int] = {}
+    keys = np.array([
+        pairs.setdefault(tuple(column[row] for column in columns), len(pairs))
+        for row in range(len(rows.point))
+    ])  # fmt: skip
+    found = []
+    for values, _, chosen in _combined(rows, rest):
+        for number, value in enumerate(levels[1:], start=1):
+            either = chosen & ((places == number) | (places == 0))
+            first = places[either] == 0
+            figures = {
+                name: Estimate.of(np.subtract(*(
+                    _table(keys[either], rows.seed[either], np.where(here, each[either], np.nan))
+                    for here in (~first, first)
+                )))
+                for name, each in rows.figures.items()
+            }  # fmt: skip
+            within = dict(zip(rest, values, strict=True))
+            if any(figures.values()):
+                found.append(
+                    Group(setting=setting, value=value, middle=None, flights=int(either.sum()),
+                          figures=figures, within=within, against=levels[0])
+                )  # fmt: skip
+    return found
+
+
+def _table(settings: NDArray[np.int64], seeds: NDArray[np.int64], values: Floats) -> Floats:
+    """Return values, a row a setting, a column a seed."""
+    _, row = np.unique(settings, return_inverse=True)
+    _, column = np.unique(seeds, return_inverse=True)
+    table = np.full((row.max(initial=-1) + 1, column.max(initial=-1) + 1), np.nan)
+    known = ~np.isnan(values)
+    table[row[known], column[known]] = values[known]
+    return table
+
+
+def _combined(
+    rows: Rows, names: Sequence[str]
+) -> Iterator[tuple[tuple[str, ...], float | None, NDArray[np.bool_]]]:
+    """Yield what the settings are together, the last one's middle, and which flights have them."""
+    if not names:
+        yield (), None, np.ones(len(rows.point), dtype=bool)
+        return
+    texts, places, middles = zip(*(_levels(rows, name) for name in names), strict=True)
+    for at in np.unique(np.column_stack(places), axis=0).tolist():
+        chosen = np.logical_and.reduce([
+            column == one for column, one in zip(places, at, strict=True)
+        ])  # fmt: skip
+        yield (
+            tuple(text[one] for text, one in zip(texts, at, strict=True)),
+            middles[-1][at[-1]],
+            chosen,
+        )
+
+
+def _levels(rows: Rows, name: str) -> tuple[list[str], NDArray[np.int64], list[float | None]]:
+    """Return the values of a setting as text, which of them each flight has, and their middles."""
     column = rows.case if name == "case" else rows.settings[name]
     values = list(dict.fromkeys(column))
-    is_number = all(isinstance(value, int | float) for value in values)
-    is_number = is_number and not any(isinstance(value, bool) for value in values)
+    is_number = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
     if len(values) <= VALUES_MAX or not is_number:
-        indices = {value: number for number, value in enumerate(values)}
-        place = np.array([indices[value] for value in column])
-        order = sorted(values) if is_number else values
-        for value in order:
-            middle = float(value) if is_number else None
-            yield _group(rows, name, shown_value(value), place == indices[value], middle)
-        return
+        values = sorted(values) if is_number else values
+        at = {value: number for number, value in enumerate(values)}
+        middles = [float(value) if is_number else None for value in values]
+        return [shown_value(v) for v in values], np.array([at[v] for v in column]), middles
     numbers = np.array(column, dtype=np.float64)
     edges = np.linspace(numbers.min(), numbers.max(), BINS + 1)
     place = np.clip(np.searchsorted(edges, numbers, side="right") - 1, 0, BINS - 1)
-    for number in range(BINS):
-        low, high = edges[number], edges[number + 1]
-        chosen = place == number
-        if chosen.any():
-            yield _group(rows, name, f"{low:.3g} to {high:.3g}", chosen, 0.5 * (low + high))
+    return (
+        [f"{low:.3g} to {high:.3g}" for low, high in pairwise(edges)],
+        place,
+        [0.5 * float(low + high) for low, high in pairwise(edges)],
+    )
 
 
 def shown_value(value: Any) -> str:
@@ -197,9 +298,9 @@ def shown_value(value: Any) -> str:
 
 
 def _group(
-    rows: Rows, setting: str, value: str, chosen: NDArray[np.bool_], middle: float | None = None
-) -> Group:
-    one_setting = len(np.unique(rows.point[chosen])) == 1
+    rows: Rows, chosen: NDArray[np.bool_], *, setting: str, value: str,
+    middle: float | None = None, within: dict[str, str] | None = None,
+) -> Group:  # fmt: skip
     return Group(
         setting=setting,
         value=value,
@@ -207,10 +308,11 @@ def _group(
         flights=int(chosen.sum()),
         figures={
             name: Estimate.of(
-                values[chosen], values[chosen] if one_setting else rows.by_point(values, chosen)
+                _table(rows.point[chosen], rows.seed[chosen], values[chosen]), least=least_of(name)
             )
             for name, values in rows.figures.items()
         },
+        within=within or {},
     )
 
 
@@ -223,7 +325,9 @@ def errors_of(rows: Rows) -> list[dict[str, Any]]:
     ]
 
 
-def as_json(rows: Rows, groups: Sequence[Group], sensitivity: Sequence[Any]) -> dict[str, Any]:
+def as_json(
+    rows: Rows, groups: Sequence[Group], differences: Sequence[Group], sensitivity: Sequence[Any]
+) -> dict[str, Any]:
     """Return all of it."""
     return {
         "campaign": rows.manifest["name"],
@@ -233,6 +337,7 @@ def as_json(rows: Rows, groups: Sequence[Group], sensitivity: Sequence[Any]) -> 
         "errors": errors_of(rows),
         "confidence": CONFIDENCE,
         "groups": [asdict(group) for group in groups],
+        "differences": [asdict(each) for each in differences],
         "sensitivity": [asdict(each) for each in sensitivity],
     }
 
@@ -243,17 +348,75 @@ def lines_of(rows: Rows, groups: Sequence[Group]) -> Iterator[str]:
     yield f"{rows.manifest['name']}: {written} of {total} flights, {rows.failed} failed"
     for each in errors_of(rows):
         yield f"failed: {each['flights']} (first: flight {each['first']}): {each['error']}"
-    names = list(rows.figures)
-    for setting in dict.fromkeys(group.setting for group in groups):
-        table = [(setting, "flights", *(_heading(name) for name in names))]
-        for group in groups:
-            if group.setting == setting:
-                cells = (_cell(group.figures[name]) for name in names)
-                table.append((group.value, str(group.flights), *cells))
+    for table in tables_of(groups):
         yield ""
         yield from plain(table)
     yield ""
-    yield f"mean ± half of its {CONFIDENCE:.0%} interval"
+    yield (
+        f"mean ± half of its {100 * CONFIDENCE:.0f} % interval over {len(rows.campaign.seeds)} "
+        "seeds, of these settings"
+    )
+
+
+def tables_of(groups: Sequence[Group]) -> Iterator[list[tuple[str, ...]]]:
+    """Yield a table for each setting, the first row of each its heading."""
+    tables: dict[tuple[str, ...], list[tuple[str, ...]]] = {}
+    for each in groups:
+        name = each.setting if each.against is None else f"{each.setting}, beyond {each.against}"
+        names = (*each.within, name, "flights")
+        rows = tables.setdefault(names, [(*names, *(_heading(name) for name in each.figures))])
+        cells = (_cell(found) for found in each.figures.values())
+        rows.append((*each.within.values(), each.value, str(each.flights), *cells))
+    yield from tables.values()
+
+
+TABLES = (".csv", ".tex", ".parquet")
+LATEX = str.maketrans({**{each: f"\\{each}" for each in "_%&#$"}, "±": r"$\pm$"})
+
+
+def write_tables(path: Path, groups: Sequence[Group]) -> None:
+    """Write the tables: for LaTeX as they are shown, else a row for each figure of each group.
+
+    Raises:
+        ConfigError: the suffix is none of these, or the file cannot be written.
+    """
+    if path.suffix not in TABLES:
+        raise ConfigError(f"--out {path}: no table has this suffix; give .csv, .tex or .parquet")
+    rows = [row for each in groups for row in _tidy(each)]
+    if path.suffix == ".csv":
+        content = csv_of(rows).encode()
+    elif path.suffix == ".tex":
+        content = "\n".join(_latex(table) for table in tables_of(groups)).encode()
+    else:
+        names = dict.fromkeys(name for row in rows for name in row)
+        columns = {name: [row.get(name) for row in rows] for name in names}
+        content = parquet_of(arrow().table(columns))
+    try:
+        write_atomically(path, content)
+    except OSError as error:
+        raise ConfigError(
+            f"--out {path}: cannot be written ({error.strerror}); give a folder that can"
+        ) from error
+
+
+def _tidy(each: Group) -> Iterator[dict[str, Any]]:
+    for figure, found in each.figures.items():
+        yield {
+            "kind": "mean" if each.against is None else "difference",
+            **each.within,
+            each.setting: each.value,
+            "against": each.against,
+            "flights": each.flights,
+            "figure": figure,
+            **({} if found is None else asdict(found)),
+        }
+
+
+def _latex(table: Sequence[Sequence[str]]) -> str:
+    head, *rows = [" & ".join(row).translate(LATEX) + r" \\" for row in table]
+    columns = "l" + "r" * (len(table[0]) - 1)
+    lines = [rf"\begin{{tabular}}{{{columns}}}", r"\hline", head, r"\hline", *rows, r"\hline"]
+    return "\n".join([*lines, r"\end{tabular}", ""])
 
 
 def _heading(figure: str) -> str:
@@ -264,8 +427,10 @@ def _cell(found: Estimate | None) -> str:
     if found is None:
         return "-"
     digits = 3 if abs(found.mean) < 10.0 else 1
-    if found.high is None:
+    if found.high is None or found.low is None:
         return f"{found.mean:.{digits}f}"
+    if found.mean - found.low < 0.999 * (found.high - found.mean):  # cut at its least value
+        return f"{found.mean:.{digits}f} [{found.low:g}, {found.high:.{digits}f}]"
     return f"{found.mean:.{digits}f} ± {found.high - found.mean:.{digits}f}"
 
 
@@ -340,6 +505,8 @@ def sensitivity_of(rows: Rows) -> list[Index]:
 def notes_of(rows: Rows, found: Sequence[Index]) -> Iterator[str]:
     """Yield why figures have no sensitivity, and why indices have no interval."""
     campaign = rows.campaign
+    if len(campaign.seeds) == 1:
+        yield "one seed: no intervals; write seeds = 10, then run it again with the same --out"
     if found and not _has_interval(rows):
         needed = SAMPLES_FOR_INTERVAL[campaign.kind]
         yield (
