@@ -14,7 +14,8 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,16 +23,17 @@ from companion.atomic_write import write_atomically
 from companion.errors import ConfigError
 from companion.wording import install_command
 from sitl.campaign.bundle import Bundle, code_sha256, versions
+from sitl.campaign.design import Campaign, read_campaign
 from sitl.campaign.flying import BY_RATE, BY_RATE_COUNTS, figure_types
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from sitl.campaign.design import Campaign
-
 FORMAT = 1
 MANIFEST, COPY, FLIGHTS, LOG = "manifest.json", "campaign.toml", "flights", "log.jsonl"
 FILE = "flights.parquet"
+# What of a manifest changes where seeds are added.
+GROWING = ("campaign_sha256", "flights", "seeds", "seed_blocks")
 # Flights of a part: what a kill may cost, against files that are too many to be read quickly.
 PARTS_WANTED, PART_LEAST, PART_MOST = 200, 10, 5000
 # Columns before the figures, the settings between them, and columns after.
@@ -65,7 +67,7 @@ def arrow() -> Any:
     return pyarrow
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Dataset:
     """The folder of one campaign."""
 
@@ -74,14 +76,20 @@ class Dataset:
     size: int
     schema: pa.Schema
 
-    @property
-    def parts(self) -> int:
-        """Return how many parts there are when all is flown."""
-        return -(-self.campaign.flights // self.size)
+    @cached_property
+    def parts(self) -> tuple[range, ...]:
+        """Return the flights of every part; seeds that were added begin a new one."""
+        found: list[range] = []
+        first = 0
+        for seeds in self.campaign.blocks:
+            end = first + seeds * self.campaign.settings_count
+            found += [range(at, min(at + self.size, end)) for at in range(first, end, self.size)]
+            first = end
+        return tuple(found)
 
     def flights_of(self, part: int) -> range:
         """Return the flights of a part."""
-        return range(part * self.size, min((part + 1) * self.size, self.campaign.flights))
+        return self.parts[part]
 
     def path_of(self, part: int) -> Path:
         """Return the file of a part."""
@@ -89,7 +97,7 @@ class Dataset:
 
     def missing(self) -> list[int]:
         """Return the parts that are still to be flown."""
-        return [part for part in range(self.parts) if not self.path_of(part).is_file()]
+        return [part for part in range(len(self.parts)) if not self.path_of(part).is_file()]
 
     def row(self, number: int, figures: Mapping[str, Any], error: str | None) -> dict[str, Any]:
         """Return a row: the flight, its settings, its figures."""
@@ -99,7 +107,7 @@ class Dataset:
         return {
             "flight": number,
             "case": case,
-            "point": number // len(self.campaign.seeds),
+            "point": self.campaign.place(number)[0],
             "seed": seed,
             **varied,
             **figures,
@@ -140,10 +148,18 @@ def open_dataset(campaign: Campaign, bundle: Bundle, folder: Path) -> Dataset:
         ConfigError: the folder holds something else, or flights of another program or file.
     """
     arrow()
+    before = read_manifest(folder) if (folder / MANIFEST).is_file() else None
+    blocks: tuple[int, ...] = ()
+    grows = False
+    if before is not None:
+        blocks = tuple(before.get("seed_blocks", [before["seeds"]]))
+        grows = _is_continued(folder, campaign, sum(blocks))
+    if before is None or grows:
+        blocks += (len(campaign.seeds) - sum(blocks),)
     dataset = Dataset(
         folder=folder,
-        campaign=campaign,
-        size=part_size(campaign.flights),
+        campaign=replace(campaign, blocks=blocks),
+        size=part_size(campaign.flights) if before is None else before["part_flights"],
         schema=_schema(campaign),
     )
     manifest = {
@@ -154,6 +170,7 @@ def open_dataset(campaign: Campaign, bundle: Bundle, folder: Path) -> Dataset:
         "flights": campaign.flights,
         "settings": campaign.settings_count,
         "seeds": len(campaign.seeds),
+        "seed_blocks": list(blocks),
         "part_flights": dataset.size,
         "varied": list(campaign.varied),
         "columns": {field.name: str(field.type) for field in dataset.schema},
@@ -164,10 +181,11 @@ def open_dataset(campaign: Campaign, bundle: Bundle, folder: Path) -> Dataset:
     }
     text = json.dumps(manifest, indent=1, sort_keys=True) + "\n"
     try:
-        if (folder / MANIFEST).is_file():
-            _refuse_other(folder, manifest)
-            return dataset
-        if folder.is_dir() and any(folder.iterdir()):
+        if before is not None:
+            _refuse_other(folder, before, manifest, GROWING if grows else ())
+            if not grows:
+                return dataset
+        elif folder.is_dir() and any(folder.iterdir()):
             raise ConfigError(f"--out {folder}: holds other files; give a new folder")
         (folder / FLIGHTS).mkdir(parents=True, exist_ok=True)
         write_atomically(folder / COPY, campaign.text.encode())
@@ -179,13 +197,23 @@ def open_dataset(campaign: Campaign, bundle: Bundle, folder: Path) -> Dataset:
     return dataset
 
 
-def _refuse_other(folder: Path, manifest: Mapping[str, Any]) -> None:
-    found = read_manifest(folder)
+def _is_continued(folder: Path, campaign: Campaign, flown: int) -> bool:
+    """Return whether a campaign is the one of a folder but for seeds behind its own."""
+    was = read_campaign(folder / COPY, checked=False)
+    same = replace(was, path=campaign.path, text=campaign.text, name=campaign.name,
+                   seeds=campaign.seeds) == campaign  # fmt: skip
+    return same and len(campaign.seeds) > flown and was.seeds[:flown] == campaign.seeds[:flown]
+
+
+def _refuse_other(
+    folder: Path, before: Mapping[str, Any], manifest: Mapping[str, Any], growing: Sequence[str]
+) -> None:
     for key, value in manifest.items():
-        if found.get(key) != value:
+        if before.get(key) != value and key not in growing:
             raise ConfigError(
                 f"--out {folder}: holds flights with another {key} (see its {MANIFEST}), which do "
-                "not go with these; give another --out"
+                "not go with these; give another --out, or change nothing but add seeds behind "
+                "the others"
             )
 
 

@@ -84,6 +84,8 @@ class Campaign:
     second_order: bool
     factors: tuple[Factor, ...]
     cases: tuple[tuple[str, Mapping[str, Value]], ...]
+    # How many of the seeds were added at a time: numbers of flights that were flown stay theirs.
+    blocks: tuple[int, ...] = ()
 
     @property
     def sha256(self) -> str:
@@ -111,16 +113,29 @@ class Campaign:
         of_cases = (name for _, case in self.cases for name in case)
         return tuple(dict.fromkeys((*(each.name for each in self.factors), *of_cases)))
 
+    def place(self, number: int) -> tuple[int, int]:
+        """Return the number of a flight's settings, and its seed."""
+        first = 0
+        for count in self.blocks:
+            if number < count * self.settings_count:
+                break
+            number -= count * self.settings_count
+            first += count
+        else:
+            count = len(self.seeds) - first
+        point, at = divmod(number, count)
+        return point, self.seeds[first + at]
+
     def flight(self, number: int) -> tuple[str, Settings, int]:
         """Return the case, all settings and the seed of one flight."""
-        point, seed = divmod(number, len(self.seeds))
+        point, seed = self.place(number)
         case, place = divmod(point, len(self.points))
         name, of_case = self.cases[case]
         varied = {
             factor.name: factor.at(share)
             for factor, share in zip(self.factors, self.points[place].tolist(), strict=True)
         }
-        return name, tuple(sorted({**self.fixed, **of_case, **varied}.items())), self.seeds[seed]
+        return name, tuple(sorted({**self.fixed, **of_case, **varied}.items())), seed
 
     def tried(self) -> Iterator[dict[str, Value]]:
         """Yield settings in which every value is tried once, beside the first of all others."""

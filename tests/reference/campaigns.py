@@ -17,7 +17,7 @@ refused with exit code 2. Ready ones: `vrspray examples copy campaigns`.
 | --- | --- |
 | `version` | 1 |
 | `name` | what tables and pictures call it; default: the file's name |
-| `seeds` | a number N for 1 to N, a list, or `{first = 1, count = 20}`; every setting is flown with each |
+| `seeds` | a number N for 1 to N, a list, or `{first = 1, count = 20}`; every setting is flown with each; more of them, behind the others, continue a campaign |
 | `[fixed]` | settings of all flights |
 | `[[case]]` | `name`, and settings of its flights: a list of flights, or beside a design, each with all of it |
 | `[design] kind` | `grid` (default), `latin-hypercube`, `sobol` or `morris` |

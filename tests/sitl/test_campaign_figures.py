@@ -15,6 +15,7 @@ from scipy import stats
 from statsmodels.stats.weightstats import CompareMeans, DescrStatsW
 from typer.testing import CliRunner
 
+from companion.errors import ConfigError
 from sitl.campaign import cli, pictures
 from sitl.campaign.bundle import bundle_of
 from sitl.campaign.dataset import Dataset, open_dataset
@@ -268,3 +269,70 @@ def test_cases_are_drawn_side_by_side(out: Path) -> None:
     panels = figure.axes
     assert [axis.get_xlabel() for axis in panels] == ["case", "vehicle.speed_m_s"]
     assert panels[1].get_legend_handles_labels()[1] == list(CASES)
+
+
+# ------------------------------------------------------------------------------------- more seeds
+
+
+def few(seeds: str) -> str:
+    return TEXT.replace(f"seeds = {SEEDS}", f"seeds = {seeds}")
+
+
+def files(out: Path) -> dict[str, bytes]:
+    return {path.relative_to(out).as_posix(): path.read_bytes() for path in out.glob("flights/*/*")}
+
+
+def sorted_rows(out: Path) -> list[tuple[Any, ...]]:
+    """Return the rows but for their numbers, in one order."""
+    return sorted(
+        tuple(value for name, value in each.items() if name != "flight" and value is not None)
+        for each in parquet(out)
+    )
+
+
+@pytest.mark.parametrize(("first", "then"), [("3", "8"), ("[1, 2, 3]", "[1, 2, 3, 4, 5, 6, 7, 8]")])
+def test_more_seeds_continue_a_campaign_and_leave_what_was_flown(
+    tmp_path: Path, out: Path, first: str, then: str
+) -> None:
+    before = files(written(tmp_path, text=few(first)))
+    again = written(tmp_path, text=few(then))
+    after = files(again)
+    assert before.items() <= after.items() and len(after) > len(before)
+    assert sorted_rows(again) == sorted_rows(out)
+    assert [each["flight"] for each in parquet(again)] == list(range(32))
+    manifest = json.loads((again / "manifest.json").read_text())
+    assert (manifest["seeds"], manifest["flights"], manifest["seed_blocks"]) == (8, 32, [3, 5])
+    assert shown(again)["differences"] == shown(out)["differences"]
+
+
+def test_seeds_are_added_again_and_to_what_was_broken_off(tmp_path: Path) -> None:
+    out = written(tmp_path, text=few("3"))
+    next(iter(sorted(out.glob("flights/*/*")))).unlink()
+    written(tmp_path, text=few("4"))
+    assert files(written(tmp_path, text=few("6"))) == files(written(tmp_path, text=few("6")))
+    assert {(each["case"], each["seed"]) for each in parquet(out)} == {
+        (case, seed) for case in CASES for seed in range(1, 7)
+    }
+
+
+def test_a_kill_between_the_two_files_of_a_continued_campaign_costs_nothing(
+    tmp_path: Path,
+) -> None:
+    out = written(tmp_path, text=few("3"))
+    manifest = (out / "manifest.json").read_bytes()
+    written(tmp_path, text=few("4"))
+    (out / "manifest.json").write_bytes(manifest)
+    assert len(parquet(written(tmp_path, text=few("4")))) == 16
+
+
+@pytest.mark.parametrize("then", ["2", "[2, 1, 3, 4]", "{first = 2, count = 5}"])
+def test_other_seeds_do_not_continue_it(tmp_path: Path, then: str) -> None:
+    written(tmp_path, text=few("3"))
+    with pytest.raises(ConfigError, match="add seeds behind the others"):
+        written(tmp_path, text=few(then))
+
+
+def test_more_seeds_of_other_settings_do_not_continue_it(tmp_path: Path) -> None:
+    written(tmp_path, text=few("3"))
+    with pytest.raises(ConfigError, match="another campaign_sha256"):
+        written(tmp_path, text=few("4").replace("6.0]", "7.0]"))
