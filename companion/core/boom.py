@@ -453,6 +453,12 @@ def place_velocity(state: VehicleState) -> tuple[float, float]:
     )
 
 
+def velocity_at(state: VehicleState, dt_s: float) -> tuple[float, float]:
+    """Return the velocity (east, north) of the reference `dt_s` from now."""
+    ae, an = state.acceleration_east_m_s2, state.acceleration_north_m_s2
+    return _carried(state, dt_s, ae, an)[:2]
+
+
 def _carried(
     state: VehicleState, dt_s: float, ae: float, an: float
 ) -> tuple[float, float, float, float]:

@@ -15,7 +15,7 @@ from itertools import pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING, NamedTuple
 
-from companion.core.boom import Intervals, Paths, sweep_at, sweeps_alike
+from companion.core.boom import sweep_at, sweeps_alike
 from companion.core.crossings import (
     NO_ROUTES,
     Crossing,
@@ -44,7 +44,7 @@ from companion.core.options.atomisers import flows_ahead, spinning
 from companion.core.options.coverage import Coverage
 from companion.core.options.drift import is_same, landed, offset
 from companion.core.options.flow_trim import TrimMemory
-from companion.core.options.lines import add_off_lines
+from companion.core.options.lines import Piece, add_off_lines
 from companion.core.options.overlap import guarded, treated_before
 from companion.core.options.pump import (
     Pumping,
@@ -316,8 +316,8 @@ def _routes(
     setup: Setup, state: VehicleState, before: KnownRoutes, area: TreatedArea | None, now_s: float
 ) -> KnownRoutes:
     """Return what each valve is prescribed along its way: carried on, or found anew."""
-    drift_m = offset(setup.drift, state, now_s)
-    if is_same(drift_m, before.drift_m):
+    drift_m, flown = offset(setup.drift, state, now_s), _flown_lines(setup, state, before)
+    if is_same(drift_m, before.drift_m) and flown != ():
         carried = carried_on(
             before,
             state,
@@ -338,7 +338,9 @@ def _routes(
         border_buffer_m=setup.border_buffer_m,
         across=setup.across,
         drift_m=drift_m,
-        close_more=_off_lines(setup, state, before),
+        close_more=None
+        if flown is None
+        else partial(add_off_lines, flown=flown, boom=setup.boom, strict=setup.border == "inside"),
         leads_s=setup.leads_s,
     )
     if setup.overlap is not None:
@@ -352,21 +354,21 @@ def _routes(
     return KnownRoutes(routes, state, drift_m)
 
 
-def _off_lines(
+def _flown_lines(
     setup: Setup, state: VehicleState, before: KnownRoutes
-) -> Callable[[Paths, list[Intervals]], None] | None:
-    """Return what closes valves off the planned lines; None where spraying needs no line."""
+) -> tuple[Piece, ...] | None:
+    """Return which planned lines are flown; None where spraying needs no line."""
     if setup.lines is None:
         return None
     was_on_one = any(zone.rate_l_ha is not None for route in before.routes for zone in route)
-    flown = setup.lines.flown(
+    return setup.lines.flown(
         state,
         back_s=setup.back_s,
         ahead_s=setup.ahead_s,
         reach_m=setup.boom.reach_m,
+        ends_s=max(timing.border_off_s for timing in setup.timings),
         entering=not was_on_one,
     )
-    return partial(add_off_lines, flown=flown, boom=setup.boom, strict=setup.border == "inside")
 
 
 # -------------------------------------------------------------------------------- changes of duty

@@ -107,15 +107,7 @@ def test_a_tolerance_as_wide_as_the_next_line_is_refused() -> None:
 
 
 # ArduCopter cuts the corners, and is slow at both ends of each line.
-# Known, and to be mended: where its boom begins to pivot at the end of a pass, at 1 m/s, a valve
-# closes up to 0.06 s late, and 0.5 mL leave the field (0.0 before paths had knots at each lead).
-@pytest.mark.parametrize(
-    ("corners", "litres"),
-    [
-        ("stop", 0.005),
-        pytest.param("ardupilot", 0.015, marks=pytest.mark.xfail(raises=AssertionError)),
-    ],
-)
+@pytest.mark.parametrize(("corners", "litres"), [("stop", 0.005), ("ardupilot", 0.015)])
 def test_the_papers_field_is_planned_and_flown_with_nothing_off_its_lines(
     corners: str,
     litres: float,

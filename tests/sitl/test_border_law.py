@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import os
-from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -16,33 +15,17 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from shapely.affinity import rotate, translate
 
-from companion.core.prescription import Prescription, Zone
 from companion.core.schedule import LagModel
-from companion.core.setup import Setup
-from companion.core.types import Decision
-from sitl.flight import FlightOptions, fly
-from sitl.profile import load_profile
 from sitl.trajectory import Trajectory
-from tests.border_flight import flows
-from tests.builders import boom, setup
-from tests.moving_flight import STEP_S, Stretch, Strip, by_reference, executed, way
+from tests.border_law import MORE_M, MOST_M_S2, Flight, worse_than_reference_m
+from tests.moving_flight import STEP_S, Stretch, way
 
 FLIGHTS = 400 if os.environ.get("HYPOTHESIS_PROFILE") == "thorough" else 12
 FLOWN = settings(max_examples=FLIGHTS, phases=[Phase.explicit, Phase.generate])
-MOST_M_S2, MOST_DEG_S = 5.0, 120.0
+MOST_DEG_S = 120.0
 SLOWEST_M_S, FASTEST_M_S = 1.2, 10.0
-MORE_M = 0.05
 # An acceleration is believed within so long; where a closing takes seconds, it counts.
 BELIEVED_S = 0.3
-PLANT = load_profile("wang-2024")
-
-
-class Flight(NamedTuple):
-    """A way with its field, and how long its valves take."""
-
-    flown: Trajectory
-    field: shapely.Geometry
-    lag: LagModel
 
 
 @st.composite
@@ -107,44 +90,6 @@ def flights(draw: st.DrawFn, *, slowest_s: float) -> Flight:
         on_start_s=on_start_s, off_end_s=off_s + draw(short), output_s=draw(st.floats(0.0, 0.03)),
     )  # fmt: skip
     return Flight(flown, field, lag)
-
-
-def made_of(flight: Flight) -> Setup:
-    parts = [part for part in shapely.get_parts(flight.field) if part.area > 0.01]
-    zones = [Zone(name=str(n), polygon=shapely.Polygon(part.exterior), rate_l_ha=20.0)
-             for n, part in enumerate(parts)]  # fmt: skip
-    return setup(
-        prescription=Prescription(zones, boundary=flight.field), boom=boom(6), lag=flight.lag,
-        most_m_s2=MOST_M_S2,
-    )  # fmt: skip
-
-
-def worse_than_reference_m(flight: Flight, late_s: float) -> float:
-    """Return by how much more any valve sprayed outside than the reference's."""
-    made, lag = made_of(flight), flight.lag
-    said: list[Decision] = []
-    fly(
-        made, flight.flown, PLANT, FlightOptions(fidelity="averaged", noise=False),
-        speed_m_s=5.0, observer=said.append,
-    )  # fmt: skip
-    steps_s = np.array([each.now_s for each in said])
-    worst_m = 0.0
-    for valve, orders in zip(made.boom.valves, executed(said, 6), strict=True):
-        first_s, last_s = lag.on_start_s + lag.output_s, lag.off_end_s + lag.output_s
-        strip = Strip(valve.right_m, valve.forward_m, valve.width_m, first_s, last_s)
-        here = flows(orders, first_s=first_s, last_s=last_s)
-        own_m = strip.beyond_m(flight.field, flight.flown, here)
-        if own_m <= worst_m:
-            continue
-        ordered = by_reference(flight.field, strip, flight.flown, steps_s)
-        # Who is late closes late, and opens no sooner.
-        late = sorted([(at_s + (0.0 if value else late_s), value) for at_s, value in ordered])
-        theirs_m = max(
-            strip.beyond_m(flight.field, flight.flown, flows(one, first_s=first_s, last_s=last_s))
-            for one in (ordered, late)
-        )
-        worst_m = max(worst_m, own_m - theirs_m)
-    return worst_m
 
 
 @FLOWN

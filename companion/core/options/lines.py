@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.core.boom import Boom, Intervals, Paths
+from companion.core.boom import Boom, Intervals, Paths, velocity_at
 from companion.core.frame import Floats, Place
 from companion.core.inputs import MISSION_MODES
 from companion.core.types import MissionLeg, VehicleState
@@ -30,6 +30,10 @@ STEP_M = CELL_M / 2.0
 # Whoever flies on a line stays on it for so long, or to its end. A ferry that crosses one at 10
 # degrees and 6 m/s drifts aside by 1 m/s: it is not, but for a moment. Gusts make some 0.3 m/s.
 STAYS_S = 1.5
+# Who turns off a line has left it when the last flow ends. The course is foretold for so long at
+# most, and may turn farther by a jerk as an autopilot's (ArduCopter's default; its simulated
+# vehicle had 5 to 9), which the filters see so much later.
+COURSE_AHEAD_S, JERK_M_S3, JERK_SEEN_S = 0.25, 5.0, 0.12
 # What closed at the tolerance opens again a tenth inside, so that noise does not make it chatter.
 ENTRY_SHARE = 0.9
 # Lines that begin where another ends lie within this of it, seen across.
@@ -98,20 +102,25 @@ class Lines:
         back_s: float,
         ahead_s: float,
         reach_m: float,
+        ends_s: float = 0.0,
         entering: bool = False,
     ) -> tuple[Piece, ...]:
         """Return the pieces of lines that `state` flies on from `back_s` ago to `ahead_s` on.
 
         One piece a line, the nearest; of several lines those in a row with the nearest. `reach_m`
-        is how far any nozzle is from the position reference. `entering` has a margin.
+        is how far any nozzle is from the position reference. `entering` has a margin. A line that
+        is left within `ends_s` is none: until then flows what is ordered closed now.
         """
         ve, vn = state.velocity_east_m_s, state.velocity_north_m_s
+        soon_s = min(ends_s, COURSE_AHEAD_S)
+        then_e, then_n = velocity_at(state, soon_s)
+        swerves = JERK_M_S3 * soon_s * (0.5 * soon_s + JERK_SEEN_S)
         speed = math.hypot(ve, vn)
         if not MOVING_M_S < speed <= SPEED_MAX_M_S:
             return ()
         aside = self.aside_m * (ENTRY_SHARE if entering else 1.0)
         course = math.cos(math.radians(self.course_deg))
-        least = speed * course
+        least, bend = speed * course, math.tan(math.radians(self.course_deg))
         ways = _ways(state)
         behind, beyond = speed * back_s + reach_m, speed * ahead_s + reach_m
         nearest: dict[int, tuple[float, float, Piece]] = {}
@@ -121,6 +130,9 @@ class Lines:
             across = ux * y - uy * x
             pace = ux * ve + uy * vn
             if not (abs(across) <= aside and abs(pace) >= least):
+                continue
+            then = math.copysign(1.0, pace) * (ux * then_e + uy * then_n)
+            if not abs(ux * then_n - uy * then_e) + swerves <= bend * then:
                 continue
             along = ux * x + uy * y
             is_forth = pace > 0.0
