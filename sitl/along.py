@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import shapely
 
+from analysis.border import off_target_ml
 from analysis.changes import changes_of
 from analysis.dose import misapplied_parts
 from analysis.strips import strips_of
@@ -44,6 +45,7 @@ from companion.core.types import (
     TimedChange,
 )
 from companion.errors import ConfigError
+from companion.wording import counted
 from missions.maps.compiling import compiled_setup
 from sitl.anyang import EXAMPLE
 from sitl.earth import Earth
@@ -482,6 +484,7 @@ def figures_of(bed: Bed, result: FlightResult) -> dict[str, Any]:
         "every_misapplied_percent": percent(np.ones_like(can)),
         "cannot_percent": 100.0 * float(asked @ (1.0 - can)) / max(float(asked.sum()), 1e-9),
         "volume_error_percent": 100.0 * (given_ml / max(asked_ml, 1e-9) - 1.0),
+        "outside_ml": off_target_ml(strips, record.prescription),
         "steps": np.array(steps).reshape(-1, 3),
         "inhibits": result.inhibits,
     }
@@ -539,7 +542,7 @@ def fly_along(options: AlongOptions, say: Callable[[str], None]) -> dict[str, An
         ]
         rows.append(_row(method, [figures_of(*each) for each in zip(beds, flights, strict=True)]))
         records[method] = flights[0].record
-        say(f"{method}: {len(flights)} flights")
+        say(f"{method}: {counted(len(flights), 'flight')}")
     bed = beds[0]
     result = {
         "log": bed.flight.name,
@@ -557,7 +560,8 @@ def fly_along(options: AlongOptions, say: Callable[[str], None]) -> dict[str, An
     if options.out is not None:
         write_result(options.out, result)
         both = {method: records[method] for method in METHODS[:2]}
-        draw(both, options.out / "along.png", say)
+        title = f"{result['log']}, vrspray, positions at {result['position_rate_hz']:g} Hz"
+        draw(both, options.out / "along.png", say, title=title)
     return result
 
 
@@ -580,7 +584,7 @@ def _row(method: str, flights: list[dict[str, Any]]) -> dict[str, Any]:
     steps = np.concatenate([each["steps"] for each in flights])
     return {
         "method": method,
-        **{name: spread(name) for name in flights[0] if name.endswith("percent")},
+        **{name: spread(name) for name in flights[0] if name.endswith(("percent", "_ml"))},
         "lag_distance_m": distances(steps[:, 0]),
         "switch_m": distances(steps[:, 1]),
         "changes": len(steps),
@@ -598,8 +602,9 @@ def _limits(rows: list[dict[str, Any]]) -> str:
     (_, best), (turn, _), (straight, _), (cannot, _) = found
     return (
         f"{best} % is the sprayer's own error, which perfect knowledge of the flight leaves too; "
-        f"in turns vrspray misapplied {turn} %, elsewhere {straight} %; {cannot} % of the volume "
-        "is not counted: there the vehicle was too slow or too fast, or pivoted back over it"
+        f"vrspray misapplied {straight} %{'' if turn == '-' else f', and {turn} % in turns'}; "
+        f"{cannot} % of the volume is not counted: there the vehicle was too slow or too fast, or "
+        "pivoted back over it"
     )
 
 
@@ -607,11 +612,12 @@ def along_lines(result: dict[str, Any]) -> Iterator[str]:
     """Yield the results for a person."""
     yield (
         f"{result['log']}: {result['flown_s']:.0f} s at {result['speed_m_s']:.1f} m/s (median), "
-        f"positions at {result['position_rate_hz']:g} Hz, {result['flights']} flights per method"
+        f"positions at {result['position_rate_hz']:g} Hz, {counted(result['flights'], 'flight')} "
+        "per method"
     )
     yield (
         f"{'':<10}{'misapplied %':>14}{'in turns':>10}{'lag m':>8}{'median':>8}{'step m':>8}"
-        f"{'volume %':>10}{'missed':>12}"
+        f"{'volume %':>10}{'outside mL':>12}{'missed':>12}"
     )
     for row in result["methods"]:
         lag, missed = row["lag_distance_m"], f"{row['missed']} of {row['changes']}"
@@ -619,7 +625,8 @@ def along_lines(result: dict[str, Any]) -> Iterator[str]:
             f"{row['method']:<10}{_number(row['misapplied_percent'], 2):>14}"
             f"{_number(row['turn_misapplied_percent']):>10}{_number(lag, 3, 'mean_abs'):>8}"
             f"{_number(lag, 3, 'median_abs'):>8}{_number(row['switch_m'], 3, 'median_abs'):>8}"
-            f"{_number(row['volume_error_percent']):>10}{missed:>12}"
+            f"{_number(row['volume_error_percent']):>10}{_number(row['outside_ml']):>12}"
+            f"{missed:>12}"
         )
     yield f"limits: {result['limits']}"
     reasons = result["methods"][0]["inhibits"]

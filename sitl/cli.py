@@ -234,6 +234,8 @@ def fly(
 
     Example: vrspray sitl fly --config examples/anyang/config.toml --mission
     examples/anyang/mission.waypoints
+
+    Example: vrspray sitl fly --along flight.BIN --out along
     """
     from companion.cli.answer import answer, note
     from companion.errors import ConfigError

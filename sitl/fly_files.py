@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from analysis.strips import strips_of
 from companion.core.types import Decision
 from companion.errors import ConfigError
 from companion.journal.journal import Journal
@@ -21,9 +22,10 @@ if TYPE_CHECKING:
 
     from analysis.flight_record import FlightRecord
     from sitl.fly import Flown
+    from sitl.trajectory import Floats
 
 RASTER_CELLS_MAX = 4_000_000
-MARGIN_M = 5.0
+MARGIN_M, SHARE_MAX = 5.0, 200.0
 
 
 def write_files(flown: Flown, folder: Path, say: Callable[[str], None]) -> list[Path]:
@@ -158,8 +160,14 @@ def _number(value: float | None, digits: int = 3) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def draw(records: Mapping[str, FlightRecord], path: Path, say: Callable[[str], None]) -> list[Path]:
-    """Draw the first record's map, what was applied, and the flow of all; return the picture."""
+def draw(
+    records: Mapping[str, FlightRecord], path: Path, say: Callable[[str], None], title: str = ""
+) -> list[Path]:
+    """Draw the first record's map, what was applied, and the flow of all; return the picture.
+
+    With a title what was applied is a share of what was prescribed for all passes together: zones
+    that were laid under a flight are prescribed anew at each of them.
+    """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -172,8 +180,13 @@ def draw(records: Mapping[str, FlightRecord], path: Path, say: Callable[[str], N
     axes = figure.subplot_mosaic([["asked", "applied"], ["flow", "flow"]], height_ratios=[3, 1])
     most = max(record.prescription.rates_l_ha) or 1.0
     _draw_asked(record, axes["asked"], most)
-    image = _draw_applied(record, axes["applied"], most)
-    figure.colorbar(image, ax=axes["applied"], label="L/ha")
+    figure.suptitle(title)
+    if title:
+        image = _draw_share(record, axes["applied"])
+        figure.colorbar(image, ax=axes["applied"], label="% of prescribed", extend="max")
+    else:
+        image = _draw_applied(record, axes["applied"], most)
+        figure.colorbar(image, ax=axes["applied"], label="L/ha")
     for name, each in records.items():
         _draw_flow(each, axes["flow"], name)
     if len(records) > 1:
@@ -211,38 +224,60 @@ def _draw_asked(record: FlightRecord, axes: Axes, most_l_ha: float) -> None:
             colour = colormaps["viridis_r"](zone.rate_l_ha / most_l_ha)
             axes.add_patch(PathPatch(outline, facecolor=colour, edgecolor="white", linewidth=0.3))
     axes.plot(record.east_m, record.north_m, color="tab:red", linewidth=0.7)
-    _frame(axes, record, "prescribed, and the way flown")
+    _frame(axes, record, f"prescribed (darkest: {most_l_ha:.1f} L/ha), and the way flown")
 
 
 def _draw_applied(record: FlightRecord, axes: Axes, most_l_ha: float) -> Any:
+    deposit = _deposit(record, record.volume_ml, 0.25)
+    applied = np.where(deposit.cells_ml > 0.0, deposit.applied_l_ha, np.nan)
+    _frame(axes, record, "applied")
+    return _show(deposit, applied, axes, vmax=most_l_ha, cmap="viridis_r")
+
+
+def _draw_share(record: FlightRecord, axes: Axes) -> Any:
+    """Draw what share of the prescribed came; black, where none was."""
+    from matplotlib import colormaps
+
+    asked_ml = np.column_stack([strip.asked_ml for strip in strips_of(record)])
+    period = max(round(record.pwm_period_s / record.step_s), 1)
+    knots_s = record.time_s[::period]
+    # Each pulse is spread over its period.
+    given_ml = [np.interp(record.time_s, knots_s, each[::period]) for each in record.volume_ml.T]
+    given = _deposit(record, np.column_stack(given_ml), 0.5)
+    asked = _deposit(record, asked_ml, 0.5).cells_ml
+    share = np.full(asked.shape, np.nan)
+    share[given.cells_ml > 0.0] = SHARE_MAX + 1.0
+    some = asked > 0.0
+    share[some] = np.minimum(100.0 * given.cells_ml[some] / asked[some], SHARE_MAX)
+    colours = colormaps["RdBu"].with_extremes(over="black")
+    _frame(axes, record, "applied, all passes; black: nothing was prescribed there")
+    return _show(given, share, axes, vmax=SHARE_MAX, cmap=colours)
+
+
+def _deposit(record: FlightRecord, volume_ml: Floats, cell_m: float) -> Deposit:
     west_m, south_m, east_m, north_m = _window(record)
     area_m2 = (east_m - west_m) * (north_m - south_m)
-    cell_m = max(0.25, float(np.sqrt(area_m2 / RASTER_CELLS_MAX)))
+    cell_m = max(cell_m, float(np.sqrt(area_m2 / RASTER_CELLS_MAX)))
     deposit = Deposit((west_m, south_m, east_m, north_m), cell_m=cell_m)
     deposit.add(
         east_m=record.east_m,
         north_m=record.north_m,
         heading_deg=record.heading_deg,
-        volume_ml=record.volume_ml,
+        volume_ml=volume_ml,
         boom=record.boom,
     )
-    applied = np.where(deposit.cells_ml > 0.0, deposit.applied_l_ha, np.nan)
+    return deposit
+
+
+def _show(deposit: Deposit, cells: Floats, axes: Axes, **more: Any) -> Any:
+    west_m, south_m, cell_m = deposit.west_m, deposit.south_m, deposit.cell_m
     extent = (
         west_m,
         west_m + deposit.columns * cell_m,
         south_m,
         south_m + deposit.rows * cell_m,
     )
-    image = axes.imshow(
-        applied,
-        origin="lower",
-        extent=extent,
-        vmin=0.0,
-        vmax=most_l_ha,
-        cmap="viridis_r",
-    )
-    _frame(axes, record, "applied")
-    return image
+    return axes.imshow(cells, origin="lower", extent=extent, vmin=0.0, **more)
 
 
 def _draw_flow(record: FlightRecord, axes: Axes, name: str) -> None:

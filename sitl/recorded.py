@@ -7,8 +7,10 @@ themselves, PX4's ULog the topics that they are made of. Stamps and gaps stay as
 
 from __future__ import annotations
 
+import os
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from pathlib import Path
@@ -19,7 +21,7 @@ from numpy.typing import NDArray
 
 from companion.errors import ConfigError
 from companion.flight_modes import COPTER
-from companion.wording import install_command
+from companion.wording import counted, install_command
 from sitl.earth import Earth
 from sitl.smoother import true_path
 from sitl.stub.protocol import AUTOPILOT_COMPONENT, Listener, sender
@@ -138,21 +140,49 @@ def read_flight(path: Path, allows: Callable[[str], bool] = bool) -> Recorded:
     Raises:
         ConfigError: it cannot be read, or holds no flight; in one line.
     """
-    reader = _READERS.get(path.suffix.lower())
-    if reader is None:
+    kind = path.suffix.lower()
+    if kind not in _READERS:
         raise ConfigError(f"{path}: not a log of a flight; give one of {', '.join(_READERS)}")
+    _look_at(path, *_HEADS[kind])
     try:
-        flight = reader(path)
+        with _silence():
+            flight = _READERS[kind](path)
         return _longest(flight, allows) or _longest(flight, bool) or _refuse(path)
     except ConfigError:
         raise
     except Exception as error:
-        # Readers raise whatever they like, and lines of it.
-        why = " ".join((getattr(error, "strerror", None) or repr(error)).split())
+        # And they raise whatever they like.
         raise ConfigError(
-            f"{path}: not a {path.suffix} log of a flight ({why}); it must hold position, velocity "
-            "and heading"
+            f"{path}: damaged, or without position, velocity or heading; copy it again, or give "
+            "the log of another flight"
         ) from error
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Let nothing be printed: readers say a line for each byte that they do not know, in C too."""
+    kept = os.dup(2)
+    try:
+        with Path(os.devnull).open("w") as nowhere, redirect_stdout(None), redirect_stderr(None):
+            os.dup2(nowhere.fileno(), 2)
+            yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
+def _look_at(path: Path, at: int, heads: tuple[bytes, ...], origin: str) -> None:
+    """Refuse what is no file with something in it, or begins as no such log does."""
+    try:
+        with path.open("rb") as file:
+            begin = file.read(16)
+    except OSError as error:
+        reason = (error.strerror or "cannot be read").lower()
+        raise ConfigError(f"{path}: {reason}; give a log from {origin}") from error
+    if not begin:
+        raise ConfigError(f"{path}: empty; copy it again from {origin}")
+    if not begin.startswith(heads, at):
+        raise ConfigError(f"{path}: not a {path.suffix} log; give one from {origin}")
 
 
 def _refuse(path: Path) -> NoReturn:
@@ -186,7 +216,8 @@ def _longest(flight: Recorded, allows: Callable[[str], bool]) -> Recorded | None
         notes.append(f"the log holds {len(found)} flights; the longest one is used")
     if missing:
         notes.append(
-            f"{missing} gaps between positions, up to {gaps_s.max():.2f} s, kept as they are"
+            f"{counted(missing, 'gap')} between positions, up to {gaps_s.max():.2f} s, kept as "
+            "recorded"
         )
     return replace(flight, states=rows, notes=tuple(notes))
 
@@ -355,6 +386,12 @@ def _ulog(path: Path) -> Recorded:
     )
 
 
+# Where the first bytes stand that every such log has, which these are, and where it comes from.
+_HEADS = {
+    ".bin": (0, (b"\xa3\x95",), "ArduPilot's SD card"),
+    ".tlog": (8, (b"\xfe", b"\xfd"), "a ground station"),
+    ".ulg": (0, (b"ULog",), "PX4's SD card"),
+}
 _READERS: dict[str, Callable[[Path], Recorded]] = {
     ".bin": _dataflash, ".tlog": _telemetry, ".ulg": _ulog
 }  # fmt: skip

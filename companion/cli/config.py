@@ -23,15 +23,24 @@ app = typer.Typer(
     help="Check or show a configuration, or print its schema.",
     epilog="Example: vrspray config check examples/anyang/config.toml",
 )
-File = Annotated[Path, typer.Argument(metavar="FILE", help="Configuration, a TOML file.")]
+File = Annotated[Path | None, typer.Argument(metavar="FILE", help="Configuration, a TOML file.")]
+SameFile = Annotated[
+    Path | None, typer.Option("--config", metavar="FILE", help="The same, as others take it.")
+]
 
 
 @app.command(epilog="Example: vrspray config check examples/anyang/config.toml")
-def check(file: File, overrides: Overrides = None, as_json: AsJson = False) -> None:
+def check(
+    file: File = None,
+    config_file: SameFile = None,
+    overrides: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
     """Check a configuration and the files that it names.
 
     Exit 0: it can be used; 2: it cannot.
     """
+    file = _named(file, config_file)
     notes: list[str] = []
     try:
         config = load(file, overrides=overrides or ())
@@ -55,6 +64,12 @@ def check(file: File, overrides: Overrides = None, as_json: AsJson = False) -> N
         as_json=as_json,
     )
     raise typer.Exit(0 if ok else 2)
+
+
+def _named(file: Path | None, config_file: Path | None) -> Path:
+    if (named := file or config_file) is None:
+        raise ConfigError("name the configuration: vrspray config check FILE")
+    return named
 
 
 def problems_of(config: Config, overrides: Sequence[str] = ()) -> list[Problem]:
@@ -172,11 +187,17 @@ def _ask(question: str, default: str) -> str:
 
 
 @app.command(epilog="Example: vrspray config show field.toml --set lag.on_s=0.12")
-def show(file: File, overrides: Overrides = None, as_json: AsJson = False) -> None:
+def show(
+    file: File = None,
+    config_file: SameFile = None,
+    overrides: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
     """Print every effective setting and where it comes from.
 
     That is the file, an override or the default.
     """
+    file = _named(file, config_file)
     settings = load(file, overrides=overrides or ()).settings()
     answer(
         {

@@ -23,7 +23,7 @@ from companion.cli.sensor_parts import build_sensors
 from companion.cli.systemd import is_ours, properties, quoted, read_unit, unit_path, watchdog_is_on
 from companion.cli.terminal import Styled, visible
 from companion.config import Config
-from companion.config.rules import mismatches, without_effect
+from companion.config.rules import mismatches, without_effect, without_power
 from companion.core.setup import Setup
 from companion.doctor.check import (
     Check,
@@ -246,6 +246,7 @@ def configuration_checks(config: Config, *, today: date) -> Iterator[Check]:
     """Yield what the configuration alone tells; it has been read, so it is valid by itself."""
     yield _agreement(config)
     yield _output(config)
+    yield _guard(config)
     yield _dead_man(config)
     yield _lags(config)
     yield calibration_age(config.lag.measured_on, today)
@@ -279,6 +280,13 @@ def _output(config: Config) -> Check:
     what = "servo outputs" if kind == "servo" else f"GPIO lines of {config.output.chip}"
     channels = ", ".join(str(valve.channel) for valve in config.valve)
     return ok("output", f"{len(config.valve)} valves on {what} {channels}")
+
+
+def _guard(config: Config) -> Check:
+    if config.output.kind != "servo":
+        return not_applicable("output-guard", "no servo outputs are used")
+    text, fix = without_power(config)
+    return warn("output-guard", text, fix) if fix else ok("output-guard", text)
 
 
 def _dead_man(config: Config) -> Check:

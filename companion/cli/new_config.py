@@ -26,9 +26,21 @@ AUTOPILOTS = ("ardupilot", "px4")
 OUTPUTS = ("servo", "gpio")
 GUARDS = ("script", "board", "none")
 _GUARD_LINES = {
-    "script": "",
-    "board": "# The driver board closes when its signal stops moving.\ndither_us = 8\n",
-    "none": '# Loss of power leaves the valves as they are.\nguard = "none-on-power-loss"\n',
+    "script": """\
+# ArduPilot's watchdog script closes the valves when this computer loses power; install it
+# (deploy/ardupilot). Without it nothing is sprayed.
+guard = "auto"
+""",
+    "board": """\
+# The driver board closes its valve when the signal stops moving, as when this computer loses power;
+# test it. The signal moves by dither_us.
+guard = "auto"
+dither_us = 8
+""",
+    "none": """\
+# Nothing closes the valves when this computer loses power: keep a hand at the pump switch.
+guard = "none-on-power-loss"
+""",
 }
 UNITS = ("L/ha", "gal/ac", "mL/m2", "L/mu")
 VALVES_MAX = 64
@@ -386,8 +398,7 @@ chip = "gpiochip0"
 """
     return f"""
 # Valves on outputs of the flight controller: pulse of closed and of fully open, as the driver
-# board takes them. Nothing is sprayed unless ArduPilot's watchdog script is seen, or a driver board
-# closes when its signal stops moving (dither_us).
+# board takes them.
 [output]
 kind = "servo"
 closed_us = 1000

@@ -230,18 +230,31 @@ def remarks(config: Document) -> Rule:
             text="not set: there is no map yet; `vrspray run` refuses to start until one is named",
         )
     yield from unbounded(config)
-    if config.output.kind == "servo" and config.output.guard != "auto":
-        yield Contradiction(
-            key="output.guard",
-            text="nothing closes the valves when this computer loses power; keep a hand at the "
-            "pump switch",
-        )
+    if config.output.kind == "servo":
+        yield Contradiction(key="output.guard", text="; ".join(filter(None, without_power(config))))
     if config.flow_meter.source == "none" and config.lag.measured_on is None:
         yield Contradiction(
             key="flow_meter.source",
             text="not set: `vrspray calibrate lag` needs a flow meter; without one, measure the "
             "lags with marks on the ground (`vrspray calibrate lag-marks`)",
         )
+
+
+def without_power(config: Document) -> tuple[str, str]:
+    """Return what closes servo outputs when this computer loses power; if nothing does, advice."""
+    if config.output.dither_us:
+        return "without power the driver board closes the valves (output.dither_us)", ""
+    if config.output.guard != "auto":
+        return (
+            "nothing closes the valves when this computer loses power",
+            "keep a hand at the pump switch",
+        )
+    if config.mission is not None and config.mission.autopilot == "px4":
+        return (
+            "PX4 has no watchdog script, so nothing will be sprayed",
+            'fit a driver board and set output.dither_us, or write "none-on-power-loss"',
+        )
+    return "without power ArduPilot's watchdog script closes the valves; else nothing sprays", ""
 
 
 def unbounded(config: Document) -> Rule:

@@ -1,8 +1,8 @@
 --[[
    vrspray_watchdog.lua: closes the spray valves when the companion computer falls silent.
 
-   An order of MAV_CMD_DO_SET_SERVO has no end: an autopilot whose companion was killed goes on with
-   the last pulse for ever. While vrspray may have a valve open it sends NAMED_VALUE_FLOAT "SPR_LIVE"
+   An order of MAV_CMD_DO_SET_SERVO has no end: an autopilot whose companion has lost power goes
+   on with the last pulse for ever. While vrspray may have a valve open it sends NAMED_VALUE_FLOAT "SPR_LIVE"
    ten times a second. This script writes the closed pulse to the valves' outputs
 
      - from its first run until the first sign of life,

@@ -95,10 +95,11 @@ def run(
         "seeds": len(campaign.seeds),
         "varied": list(campaign.varied),
     }
-    if dry_run:
-        answer(plan, _plan_lines(campaign), as_json=as_json)
-        return
     code = {str(given.get("method.controller", "")) for given in campaign.tried()} - {""}
+    if dry_run:
+        needs = ["needs --allow-code: it runs the code of " + ", ".join(sorted(code))] * bool(code)
+        answer(plan | {"code": sorted(code)}, [*_plan_lines(campaign), *needs], as_json=as_json)
+        return
     if code and not allow_code:
         raise ConfigError(
             f"{file}: method.controller = '{min(code)}': this code would run on each worker; "

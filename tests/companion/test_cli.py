@@ -302,9 +302,10 @@ def test_command_of_config_has_json_and_an_example(
 
 def test_config_check_accepts_the_example(capsys: Captured) -> None:
     code, found = run_json(capsys, "config", "check", CONFIG)
-    everywhere, unmetered = found.pop("notes")
+    everywhere, guarded, unmetered = found.pop("notes")
     assert (code, found) == (0, {"ok": True, "path": CONFIG, "problems": []})
     assert "the drone sprays the whole map" in everywhere
+    assert "watchdog script closes the valves" in guarded
     assert "calibrate lag` needs a flow meter" in unmetered
 
 

@@ -42,24 +42,62 @@ def test_what_is_written_passes_the_check(
 
 
 @pytest.mark.parametrize(
-    ("autopilot", "output", "dither_us", "guard"),
+    ("autopilot", "output", "dither_us", "guard", "said"),
     [
-        ("ardupilot", "servo", 0, "auto"),
-        ("ardupilot", "servo 9 board", 8, "auto"),
-        ("ardupilot", "servo none", 0, "none-on-power-loss"),
-        ("px4", "servo", 8, "auto"),
-        ("px4", "servo 1 none", 0, "none-on-power-loss"),
-        ("px4", "gpio 5", 0, "auto"),
+        ("ardupilot", "servo", 0, "auto", "watchdog script closes"),
+        ("ardupilot", "servo 9 board", 8, "auto", "driver board closes"),
+        ("ardupilot", "servo none", 0, "none-on-power-loss", "nothing closes"),
+        ("px4", "servo", 8, "auto", "driver board closes"),
+        ("px4", "servo 1 none", 0, "none-on-power-loss", "nothing closes"),
+        ("px4", "gpio 5", 0, "auto", ""),
     ],
 )
-def test_what_closes_without_power_is_written(
-    autopilot: str, output: str, dither_us: int, guard: str, tmp_path: Path
+def test_what_closes_without_power_is_written_and_said(
+    autopilot: str,
+    output: str,
+    dither_us: int,
+    guard: str,
+    said: str,
+    tmp_path: Path,
+    capsys: Captured,
 ) -> None:
     out = tmp_path / "field.toml"
     words = ["--autopilot", autopilot, "--output", output]
     assert execute(["config", "new", "--yes", "--out", str(out), *words]) == 0
     written = load(out).output
     assert (written.dither_us, written.guard) == (dither_us, guard)
+    # In the file, by its own line; and wherever the configuration is looked at.
+    assert (f'guard = "{guard}"' in out.read_text()) is bool(said)
+    assert said in capsys.readouterr().out
+    assert execute(["config", "check", "--config", str(out)]) == 0
+    assert said in capsys.readouterr().out
+    assert execute(["doctor", "--config", str(out), "--no-link"]) in (0, 1)
+    (line,) = [each for each in capsys.readouterr().out.splitlines() if "output-guard" in each]
+    assert said in line
+    level = "-" if not said else "warn" if guard != "auto" else "ok"
+    assert line.split()[0] == level
+
+
+def test_px4_without_a_board_is_said_to_spray_nothing(tmp_path: Path, capsys: Captured) -> None:
+    out = tmp_path / "field.toml"
+    assert execute(["config", "new", "--yes", "--out", str(out), "--autopilot", "px4"]) == 0
+    given = ["--config", str(out), "--set", "output.dither_us=0"]
+    capsys.readouterr()
+    assert execute(["config", "check", *given]) == 0
+    assert "nothing will be sprayed" in capsys.readouterr().out
+    assert execute(["doctor", "--no-link", *given]) in (0, 1)
+    assert "warn  output-guard: PX4 has no watchdog script" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["check", "show"])
+def test_a_configuration_is_named_as_doctor_and_run_name_it(command: str, capsys: Captured) -> None:
+    path = str(ROOT / "examples" / "anyang" / "config.toml")
+    assert execute(["config", command, path]) == 0
+    plain = capsys.readouterr().out
+    assert execute(["config", command, "--config", path]) == 0
+    assert capsys.readouterr().out == plain
+    assert execute(["config", command]) == 2
+    assert "name the configuration" in capsys.readouterr().err
 
 
 def test_six_questions_are_asked_and_answered(tmp_path: Path) -> None:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import os
+import struct
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 from typer.testing import CliRunner
 
 import sitl.along
 from companion.cli.app import app
+from companion.core.prescription import Prescription
 from companion.errors import ConfigError
 from sitl.along import (
     METHODS,
@@ -27,6 +30,7 @@ from sitl.along import (
 )
 from sitl.anyang import EXAMPLE
 from sitl.earth import Earth
+from sitl.fly_files import _draw_share
 from sitl.follow import Told, along
 from sitl.recorded import paths_of, read_flight, receiver_behind
 from sitl.serve import Following, Step
@@ -46,6 +50,15 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 # ------------------------------------------------------------------------------------------ reading
+
+# What every dataflash log begins with: the format of formats, then that of its places.
+DATAFLASH = b"".join(
+    b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", number, length, name, form, columns)
+    for number, length, name, form, columns in (
+        (128, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns"),
+        (129, 23, b"POS", b"QLLf", b"TimeUS,Lat,Lng,RelHomeAlt"),
+    )
+)
 
 
 @pytest.mark.parametrize("form", ["tlog", "ulg"])
@@ -75,7 +88,7 @@ def test_a_log_that_pauses_is_two_flights_and_the_longer_one_is_flown(tmp_path: 
     assert flight.states.time_s[0] >= 109.0
     assert flight.notes == ("the log holds 2 flights; the longest one is used",)
     short = read_flight(flown_logs.telemetry(tmp_path / "b.tlog", skip_s=(108.0, 108.5)))
-    assert short.notes == ("1 gaps between positions, up to 0.60 s, kept as they are",)
+    assert short.notes == ("1 gap between positions, up to 0.60 s, kept as recorded",)
 
 
 def test_an_autopilot_that_begins_anew_has_flown_twice(log: Path, tmp_path: Path) -> None:
@@ -89,19 +102,30 @@ def test_an_autopilot_that_begins_anew_has_flown_twice(log: Path, tmp_path: Path
 @pytest.mark.parametrize(
     ("name", "content", "why"),
     [
-        ("a.tlog", b"", "no flight"),
-        ("a.tlog", b"\0" * 5000, "no flight"),
-        ("a.bin", b"", "not a .bin log"),
-        ("a.bin", b"\xa3\x95\x80" + b"x" * 5000, "not a .bin log"),
+        ("a.tlog", b"", "empty"),
+        ("a.tlog", b"\0" * 5000, "not a .tlog log"),
+        ("a.tlog", b"\0" * 8 + b"\xfe\x01" + b"\0" * 5000, "no flight"),
+        ("a.bin", b"", "empty"),
+        ("a.BIN", b"Renamed.\n" * 5000, "not a .BIN log"),
+        ("a.bin", b"\xa3\x95\x80" + b"x" * 5000, "damaged"),
+        ("a.bin", DATAFLASH + b"x" * 5000, "damaged"),
+        ("a.bin", DATAFLASH.replace(b"QLLf", b"Q\\Lf"), "damaged"),
         ("a.csv", b"1,2", "give one of .bin, .tlog, .ulg"),
-        ("a.ulg", b"ULog", "not a .ulg log"),
-        ("missing.tlog", None, "No such file"),
+        ("a.ulg", b"", "empty"),
+        ("a.ulg", b"Renamed.", "not a .ulg log"),
+        ("a.ulg", b"ULog", "damaged"),
+        ("missing.tlog", None, "no such file"),
+        ("missing.BIN", None, "no such file"),
     ],
 )
 def test_what_is_no_log_is_refused_in_one_line(
-    name: str, content: bytes | None, why: str, tmp_path: Path
+    name: str,
+    content: bytes | None,
+    why: str,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
-    if name.endswith("ulg"):
+    if why == "damaged" and name.endswith("ulg"):
         pytest.importorskip("pyulog")
     path = tmp_path / name
     if content is not None:
@@ -111,6 +135,9 @@ def test_what_is_no_log_is_refused_in_one_line(
     assert why in str(refused.value)
     assert str(path) in str(refused.value)
     assert "\n" not in str(refused.value)
+    # No word of Python's, and nothing of the reader's own.
+    assert "Error" not in str(refused.value)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_without_pyulog_a_line_says_how_to_get_it(
@@ -240,6 +267,43 @@ def test_a_flight_is_judged_beside_its_references(log: Path, tmp_path: Path) -> 
     lines = list(along_lines(result))
     assert lines[5].startswith("look-ahead")
     assert any(line.startswith("limits: ") for line in lines)
+
+
+def test_what_falls_outside_is_counted_and_drawn(log: Path) -> None:
+    pytest.importorskip("matplotlib")
+    from matplotlib.figure import Figure
+
+    bed = prepare(AlongOptions(log=log, position_rate_hz=10.0))
+    south = shapely.box(-500.0, -500.0, 500.0, 25.0)
+    zones = [
+        replace(zone, polygon=zone.polygon.intersection(south))
+        for zone in bed.setup.prescription.zones
+        if zone.polygon.intersects(south)
+    ]
+    bed = replace(bed, setup=replace(bed.setup, prescription=Prescription(zones)))
+    outside_ml, cells = {}, {}
+    for method in ("vrspray", "none"):
+        result = fly_method(bed, method, 1)
+        outside_ml[method] = figures_of(bed, result)["outside_ml"]
+        axes = Figure().subplots()
+        cells[method] = np.ma.compressed(_draw_share(result.record, axes).get_array())
+    assert outside_ml["vrspray"] < 0.5 < 5.0 < outside_ml["none"]
+    # Ground on which nothing was prescribed is off the scale; the rest got what it should.
+    assert (cells["none"] > 200.0).sum() > 10 > (cells["vrspray"] > 200.0).sum()
+    assert np.median(cells["vrspray"]) == pytest.approx(100.0, abs=5.0)
+
+
+@needs_logs
+def test_ground_flown_over_twice_is_not_drawn_as_too_wet() -> None:
+    """Passes that cross each other: the zones are prescribed to each of them."""
+    pytest.importorskip("matplotlib")
+    from matplotlib.figure import Figure
+
+    bed = prepare(AlongOptions(log=LOGS / "q130.BIN", position_rate_hz=10.0))
+    image = _draw_share(fly_method(bed, "vrspray", 1).record, Figure().subplots())
+    cells = np.ma.compressed(image.get_array())
+    assert np.median(cells) == pytest.approx(100.0, abs=5.0)
+    assert np.quantile(cells, 0.95) < 130.0
 
 
 def test_a_flight_by_hand_is_sprayed_and_said_to_be_barred(tmp_path: Path) -> None:

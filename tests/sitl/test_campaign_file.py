@@ -155,6 +155,7 @@ def test_code_that_a_file_names_runs_by_the_users_word_alone(
     assert f"{file}: method.controller = '{name}'" in line
     assert "--allow-code" in line and "\n" not in line
     assert execute([*given, "--dry-run"]) == 0
+    assert f"needs --allow-code: it runs the code of {name}\n" in capsys.readouterr().out
     assert not mark.exists()
     if form == "own.py:Own":
         assert execute([*given, "--allow-code"]) == 0
