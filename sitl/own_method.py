@@ -11,9 +11,12 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import math
+import signal
 import sys
+import threading
 import traceback
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
@@ -35,6 +38,8 @@ if TYPE_CHECKING:
 LEASE_S = 1.0
 # Of an order that is to take effect later.
 AFTER_MAX_S = 10.0
+# Processor time of one answer, many thousand times what any needs; then it is raised so often.
+ANSWER_MAX_S, AGAIN_S = 10.0, 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -129,8 +134,35 @@ class MakeController(Protocol):
         """Return one for a flight."""
 
 
+class EndlessError(BaseException):
+    """A method that comes to no answer; no Exception, which the method may swallow."""
+
+
 class ControllerError(ConfigError):
     """A method of one's own that cannot be loaded, raised, or ordered what is no order."""
+
+
+# Whatever a method raises; Ctrl-C is nobody's fault.
+RAISED = (Exception, SystemExit, EndlessError)
+
+
+@contextmanager
+def _in_time() -> Iterator[None]:
+    """Raise in what takes too much processor time; other threads are a campaign's to bound."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(*_: object) -> None:
+        raise EndlessError(f"no answer within {ANSWER_MAX_S:g} s of processor time, a loop?")
+
+    before = signal.signal(signal.SIGVTALRM, end)
+    signal.setitimer(signal.ITIMER_VIRTUAL, ANSWER_MAX_S, AGAIN_S)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
+        signal.signal(signal.SIGVTALRM, before)
 
 
 # ------------------------------------------------------------------------------------------ loading
@@ -148,8 +180,9 @@ def load_controller(name: str) -> MakeController:
     if not place or not attribute.isidentifier():
         raise ControllerError(f"--controller {name}: give module:Class or file.py:Class")
     try:
-        module = _file(Path(place)) if place.endswith(".py") else _module(place)
-    except (Exception, SystemExit) as error:
+        with _in_time():
+            module = _file(Path(place)) if place.endswith(".py") else _module(place)
+    except RAISED as error:
         raise ControllerError(f"--controller {name}: {_why(error)}") from error
     found = getattr(module, attribute, None)
     if not isinstance(found, type) or not callable(getattr(found, "order", None)):
@@ -167,8 +200,9 @@ def made(make: MakeController, name: str, sprayer: Sprayer) -> Controller:
         ControllerError: it raised; in one line.
     """
     try:
-        return make(sprayer)
-    except (Exception, SystemExit) as error:
+        with _in_time():
+            return make(sprayer)
+    except RAISED as error:
         raise ControllerError(f"{name}: {_why(error)}, before the flight") from error
 
 
@@ -237,7 +271,7 @@ class OwnFlight:
             state = estimate(track, now_s)
             try:
                 plan = self._asked(item, state, now_s)
-            except (Exception, SystemExit) as error:
+            except RAISED as error:
                 self._submit(self._plan_of((), now_s, open_=False), now_s)
                 raise ControllerError(
                     f"{self.name}: {_why(error)}, {now_s - start_s:.1f} s after the start of the "
@@ -265,18 +299,18 @@ class OwnFlight:
     def _ask(self, item: Telemetry, state: VehicleState, now_s: float, *, may_spray: bool) -> None:
         """Take what the method orders after a message; one without place or speed is not shown."""
         east_m, north_m = self.setup.frame.to_local(item.latitude_deg, item.longitude_deg)
-        answer = self.controller.order(
-            Seen(
-                now_s=now_s,
-                east_m=east_m,
-                north_m=north_m,
-                velocity_east_m_s=item.velocity_east_m_s or 0.0,
-                velocity_north_m_s=item.velocity_north_m_s or 0.0,
-                heading_deg=item.heading_deg,
-                height_m=state.height_m,
-                may_spray=may_spray,
-            )
+        seen = Seen(
+            now_s=now_s,
+            east_m=east_m,
+            north_m=north_m,
+            velocity_east_m_s=item.velocity_east_m_s or 0.0,
+            velocity_north_m_s=item.velocity_north_m_s or 0.0,
+            heading_deg=item.heading_deg,
+            height_m=state.height_m,
+            may_spray=may_spray,
         )
+        with _in_time():
+            answer = self.controller.order(seen)
         if answer is not None:
             self._take(answer, now_s)
 

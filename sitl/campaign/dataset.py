@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import io
 import json
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -90,6 +91,10 @@ class Dataset:
     def flights_of(self, part: int) -> range:
         """Return the flights of a part."""
         return self.parts[part]
+
+    def part_of(self, number: int) -> int:
+        """Return the part of a flight."""
+        return bisect_right(self.parts, number, key=lambda part: part.start) - 1
 
     def path_of(self, part: int) -> Path:
         """Return the file of a part."""

@@ -482,7 +482,7 @@ def _keep(flying: _Flying, number: int, figures: dict[str, Any], error: str | No
     dataset, tally = flying.dataset, flying.tally
     if flying.suspects and flying.suspects[0] == number:
         flying.suspects.pop(0)
-    part = number // dataset.size
+    part = dataset.part_of(number)
     rows = flying.rows.setdefault(part, [])
     rows.append(dataset.row(number, figures, error))
     tally.flights += 1

@@ -351,6 +351,8 @@ def lines_of(rows: Rows, groups: Sequence[Group]) -> Iterator[str]:
     for table in tables_of(groups):
         yield ""
         yield from plain(table)
+    if len(rows.campaign.seeds) < 2:
+        return
     yield ""
     yield (
         f"mean ± half of its {100 * CONFIDENCE:.0f} % interval over {len(rows.campaign.seeds)} "
@@ -413,7 +415,7 @@ def _tidy(each: Group) -> Iterator[dict[str, Any]]:
 
 
 def _latex(table: Sequence[Sequence[str]]) -> str:
-    head, *rows = [" & ".join(row).translate(LATEX) + r" \\" for row in table]
+    head, *rows = [" & ".join(cell.translate(LATEX) for cell in row) + r" \\" for row in table]
     columns = "l" + "r" * (len(table[0]) - 1)
     lines = [rf"\begin{{tabular}}{{{columns}}}", r"\hline", head, r"\hline", *rows, r"\hline"]
     return "\n".join([*lines, r"\end{tabular}", ""])

@@ -148,6 +148,28 @@ def test_a_campaign_whose_scheduler_is_killed_goes_on_to_the_same_bytes(
     assert files_of(out) == files_of(reference)
 
 
+def test_seeds_that_are_added_are_flown_and_nothing_else_is(
+    here: Path, reference: Path, tmp_path: Path
+) -> None:
+    text = here.read_text()
+    here.write_text(text.replace("seeds = 4", "seeds = 3"))
+    fly_here(here, tmp_path / "out")
+    before = files_of(tmp_path / "out" / "flights")
+    here.write_text(text)
+    assert fly_here(here, tmp_path / "out").flights == 6
+    assert before.items() < files_of(tmp_path / "out" / "flights").items()
+    key = ["case", "seed", "vehicle.gust_m_s", "config.lag.up_s"]
+    found, wanted = (
+        sorted(
+            ({**row, "flight": None} for row in rows_of(out)),
+            key=lambda row: [row[name] for name in key],
+        )
+        for out in (tmp_path / "out", reference)
+    )
+    assert found == wanted
+    assert [row["flight"] for row in rows_of(tmp_path / "out")] == list(range(24))
+
+
 KILLER = """
 import os, signal
 

@@ -237,8 +237,11 @@ def test_a_table_for_a_paper_needs_no_package(out: Path, tmp_path: Path) -> None
     assert (
         r"vehicle.speed\_m\_s" in text and r"$\pm$" in text and "_" not in text.replace(r"\_", "")
     )
-    lines = [line for line in text.splitlines() if "&" in line]
-    assert all(line.endswith(r"\\") for line in lines)
+    for table in text.split(r"\begin{tabular}")[1:]:
+        columns = len(table.partition("}")[0]) - 1
+        lines = [line for line in table.splitlines() if line.endswith(r"\\")]
+        assert len(lines) > 1 and all(line.count(" & ") == columns - 1 for line in lines)
+    assert "\\&" not in text
 
 
 def test_what_is_no_table_is_refused(out: Path, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import signal
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from analysis.evaluation import evaluate
 from companion.cli.app import execute
 from companion.core.setup import Setup
 from companion.core.types import HeartbeatReport, Input, SprayPlan, Telemetry, TimedChange
+from sitl import own_method
 from sitl.anyang import demo_lags, demo_setup, demo_trajectory
 from sitl.flight import FlightOptions, FlightResult, fly
 from sitl.outputs import PlanFollower
@@ -197,6 +199,39 @@ def test_a_method_that_fails_closes_the_valves_and_ends_in_one_line(
     assert "\n" not in str(caught.value)
     assert any(each.duty == 1.0 for each in valves.orders)
     assert valves.follower.duty == [0.0] * 6
+
+
+LOOPS = """
+class Swallows:
+    def __init__(self, sprayer):
+        {at_first}
+
+    def order(self, seen):
+        while True:
+            try:
+                len("round and round")
+            except Exception:
+                pass
+"""
+
+
+@pytest.mark.parametrize(
+    ("at_first", "where"),
+    [
+        ("pass", "after the start of the flight; all valves closed"),
+        ("\n        while True:\n            pass", "before the flight"),
+    ],
+)
+def test_a_method_that_comes_to_no_answer_is_stopped_with_a_word(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_first: str, where: str
+) -> None:
+    monkeypatch.setattr(own_method, "ANSWER_MAX_S", 0.2)
+    (tmp_path / "loops.py").write_text(LOOPS.format(at_first=at_first))
+    name = f"{tmp_path / 'loops.py'}:Swallows"
+    with pytest.raises(ControllerError, match=f"no answer within 0.2 s.*loops.py.*{where}"):
+        flown(load_controller(name))
+    assert signal.getitimer(signal.ITIMER_VIRTUAL) == (0.0, 0.0)
+    assert signal.getsignal(signal.SIGVTALRM) == signal.SIG_DFL
 
 
 def test_a_class_that_cannot_be_made_is_one_line() -> None:
