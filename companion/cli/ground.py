@@ -407,6 +407,8 @@ _WORDS: dict[str, str] = {
     GroundReason.LANDED_UNKNOWN: "landed or flying is not reported (EXTENDED_SYS_STATE)",
     GroundReason.NOT_LANDED: "the vehicle does not report that it is on the ground",
     GroundReason.OUTPUT_FAULT: "the outputs have a fault",
+    GroundReason.UNGUARDED: "nothing would close without power (no watchdog script or board); "
+    "see output.guard",
     GroundReason.OUTPUTS_NEED_ARMING: "servo outputs of this autopilot follow orders only while it "
     'is armed (PX4), and ground work needs it disarmed; use valves on GPIO (output.kind = "gpio")',
     GroundReason.STOPPED: "stopped by MAVLink or by the emergency stop",

@@ -166,7 +166,10 @@ class _Work:
         fault, rival = self._executor.fault or self._link.fault, self._link.rival
         self.fault = fault or rival or self.fault
         report = OutputReport(
-            received_s=now_s, healthy=fault is None and rival is None, text=fault or rival or ""
+            received_s=now_s,
+            healthy=fault is None and rival is None,
+            guarded=self._executor.is_guarded,
+            text=fault or rival or "",
         )
         state = observe_ground(self._state, report)
         self._state = GroundState(

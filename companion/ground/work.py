@@ -225,6 +225,7 @@ class GroundReason(StrEnum):
     NOT_LANDED = "not-landed"
     OUTPUT_FAULT = "output-fault"
     OUTPUTS_NEED_ARMING = "outputs-need-arming"
+    UNGUARDED = "unguarded"
     STOPPED = "stopped"
     ESTOP_UNKNOWN = "estop-unknown"
     NO_ORDER = "no-order"
@@ -327,6 +328,8 @@ def ground_reasons(setup: GroundSetup, state: GroundState, now_s: float) -> froz
         found.append(GroundReason.MISSION_ACTIVE)
     if state.output is None or state.output.healthy is not True:
         found.append(GroundReason.OUTPUT_FAULT)
+    elif state.output.guarded is not True:
+        found.append(GroundReason.UNGUARDED)
     if state.was_stopped is not False or setup.rc_channel in state.turned_off:
         found.append(GroundReason.STOPPED)
     if setup.has_estop_line and state.estop_line is not False:

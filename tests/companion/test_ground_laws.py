@@ -46,6 +46,7 @@ class Moment:
     landed_age_s: float | None
     on_ground: bool
     healthy: object
+    guarded: bool
     mission: bool | None
     stopped: bool
 
@@ -63,7 +64,11 @@ class Moment:
                 received_s=now_s - self.landed_age_s, in_air=False, on_ground=self.on_ground
             )
         if self.healthy is not None:
-            output = OutputReport(received_s=now_s, healthy=self.healthy)  # type: ignore[arg-type]
+            output = OutputReport(
+                received_s=now_s,
+                healthy=self.healthy,  # type: ignore[arg-type]
+                guarded=self.guarded,
+            )
         return GroundState(
             heartbeat=heartbeat,
             landed=landed,
@@ -85,6 +90,7 @@ class Moment:
             and -0.1 <= self.landed_age_s <= 2.5
             and self.on_ground
             and self.healthy is True
+            and self.guarded
             and self.mission is not True
             and not self.stopped
         )
@@ -110,6 +116,7 @@ MOMENTS = st.builds(
     landed_age_s=mostly(0.2, *AGES),  # type: ignore[arg-type]
     on_ground=mostly(True, False),  # type: ignore[arg-type]
     healthy=mostly(True, False, None, math.nan),
+    guarded=mostly(True, False),  # type: ignore[arg-type]
     mission=mostly(False, None, True),  # type: ignore[arg-type]
     stopped=mostly(False, True),  # type: ignore[arg-type]
 )
@@ -124,6 +131,7 @@ STEADY = Moment(
     landed_age_s=0.2,
     on_ground=True,
     healthy=True,
+    guarded=True,
     mission=None,
     stopped=False,
 )

@@ -137,6 +137,10 @@ REFUSED: list[tuple[GroundReason, dict[str, object]]] = [
     (GroundReason.NOT_LANDED, {"landed": landed(in_air=False, on_ground=False)}),
     (GroundReason.OUTPUT_FAULT, {"output": None}),
     (GroundReason.OUTPUT_FAULT, {"output": OutputReport(received_s=NOW_S, healthy=False)}),
+    (
+        GroundReason.UNGUARDED,
+        {"output": OutputReport(received_s=NOW_S, healthy=True, guarded=False)},
+    ),
     (GroundReason.STOPPED, {"was_stopped": True}),
 ]
 

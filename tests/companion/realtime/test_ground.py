@@ -46,6 +46,18 @@ async def test_a_held_space_bar_primes_and_ends_by_itself(tmp_path: Path) -> Non
     assert json.loads(record[0])["kind"] == "prime"
 
 
+async def test_nothing_opens_that_nobody_would_close_without_power(tmp_path: Path) -> None:
+    peer = standing()
+    peer.has_script = False
+    async with session(example(tmp_path), "prime", "--seconds", "2", peer=peer) as work:
+        await work.until_told("Type spray")
+        work.press(b"spray\n")
+        code, _ = await work.ended()
+    assert code == 1
+    assert b"no watchdog script or board" in work.told
+    assert {order.pulse_us for order in peer.orders} == {1000}
+
+
 @pytest.mark.parametrize(("ending", "code"), [("let go", 0), ("ctrl-c", 130)])
 async def test_letting_go_closes_and_so_does_ctrl_c(tmp_path: Path, ending: str, code: int) -> None:
     async with session(example(tmp_path), "flush", "--together", "--seconds", "30") as work:
