@@ -89,9 +89,14 @@ class Closer:
         """Begin anew to close: what the companion has begun to send may be half a frame."""
         self._cuts = not self._is_udp
 
+    @property
+    def can_close(self) -> bool:
+        """Whether there is a link, and the vehicle was heard on it."""
+        return self._file >= 0 and self._told["is_px4"] is not None
+
     def close(self) -> None:
         """Order all outputs closed, once."""
-        if self._file < 0 or self._told["is_px4"] is None:
+        if not self.can_close:
             return
         if self._cuts:
             self._cuts = False
@@ -173,7 +178,7 @@ class Guardian:
                 return
             ends = ends or self._is_gone or self._wake in ready
             self._turn(ends=ends)
-        if self._is_gone and self._note:
+        if self._is_gone and self._note and self._closer.can_close:
             told = {"closed_s": time.time(), "rounds": self.rounds}
             with suppress(OSError):
                 Path(self._note).write_text(json.dumps(told), encoding="utf-8")
@@ -208,7 +213,9 @@ class Guardian:
             self._alive_s = self._round_s = now_s
             self._closer.begin()
         if ends and not self.ends_s < float("inf"):
-            self.ends_s, self._round_s = now_s + AFTER_S, now_s
+            # A start that heard nobody has nobody to close: the next one needs the port.
+            is_idle = self._is_gone and not self._closer.can_close
+            self.ends_s, self._round_s = now_s + AFTER_S * (not is_idle), now_s
         if self._is_closing and not now_s < self._round_s:
             self._round_s = now_s + ROUND_S
             self.rounds += 1

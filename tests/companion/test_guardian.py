@@ -19,7 +19,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.guardian import AFTER_S
-from companion.guardian.__main__ import LINK_NUMBER, PAD, ROUND_S, Closer
+from companion.guardian.__main__ import LINK_NUMBER, PAD, ROUND_S, Closer, Guardian
 from companion.output.autopilot_options import DriveOutput, ServoOptions
 from companion.output.child import Child
 from companion.output.guarded import COMMAND, GuardianSetup
@@ -213,6 +213,22 @@ def test_the_end_of_the_companion_closes_and_ends_it(tmp_path: Path) -> None:
         one.child.end(AFTER_S + 3.0)
         assert time.monotonic() - begun_s >= AFTER_S
     assert json.loads(note.read_text())["rounds"] >= AFTER_S / ROUND_S - 1
+
+
+def test_one_whose_companion_heard_nobody_holds_no_link_and_tells_no_tale(tmp_path: Path) -> None:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    wake, waker = os.pipe()
+    with ours, theirs, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+        ours.send(setup(note=tmp_path / "none"))
+        socket.send_fds(ours, [json.dumps(told(is_px4=None)).encode()], [link.fileno()])
+        ours.shutdown(socket.SHUT_WR)
+        guardian = Guardian(theirs, wake)
+        guardian.serve()
+    os.close(wake)
+    os.close(waker)
+    # A round each 0.2 s: it has not gone on for two seconds.
+    assert guardian.rounds <= 2
+    assert not (tmp_path / "none").exists()
 
 
 def test_its_last_word_ends_it_without_an_order(tmp_path: Path) -> None:

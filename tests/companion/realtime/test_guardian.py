@@ -277,6 +277,27 @@ async def test_a_new_start_closes_before_it_reads_a_map(config: Path, tmp_path: 
     await is_gone(reader)
 
 
+async def test_one_that_is_killed_before_it_heard_the_vehicle_leaves_it_to_the_next_start(
+    config: Path,
+) -> None:
+    """Whom to close, and how, nobody has said by then; the next start finds the port at once."""
+    port, peer = free_port(), peer_in_the_middle()
+    peer.outputs = dict.fromkeys(range(9, 15), 1700)
+    peer.is_silent = True
+    url = f"udpin:127.0.0.1:{port}"
+    async with over_udp(peer, port):
+        async with started(config, url) as first:
+            async with asyncio.timeout(20.0):
+                while not (guardians := children_of(first.pid)):  # noqa: ASYNC110
+                    await asyncio.sleep(0.01)
+            first.kill()
+            await is_gone(guardians[0])
+        assert peer.outputs[9] == 1700
+        peer.is_silent = False
+        async with started(config, url):
+            await peer.until(lambda: peer.is_all_closed, within_s=20.0)
+
+
 async def test_over_tcp_and_after_half_a_frame(config: Path) -> None:
     peer = peer_in_the_middle()
     host = TcpHost(peer)
