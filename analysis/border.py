@@ -11,12 +11,13 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
+import shapely
 
 from analysis.changes import SPEED_MIN_M_S, Run, bisect
 from analysis.holds import BESIDE_S, CLEAR_M
 from analysis.lag import DWELL_MIN_S, Step, Verdict
 from analysis.strips import GRAZE_M, Strip
-from analysis.track import TOUCH_M, Bools, Floats, Ints, Track
+from analysis.track import TOUCH_M, Bools, Floats, Ints, Track, in_field
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -38,6 +39,13 @@ DELAY_MAX_S = 3.0
 # So many crossings of one valve and kind before their delays say how far they scatter.
 ALIKE_MIN = 3
 POSITION_SDS = 2.33
+
+
+class OffTarget(NamedTuple):
+    """Volumes beyond the border or in exclusions, and inside but off every planned line."""
+
+    outside_ml: float
+    off_line_ml: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -243,12 +251,20 @@ def _edges_s(
 
 
 def off_target_ml(strips: Sequence[Strip], prescription: Prescription) -> float:
-    """Return the volume that fell outside the field.
+    """Return the volume that fell outside the field."""
+    return off_target(strips, prescription).outside_ml
+
+
+def off_target(strips: Sequence[Strip], prescription: Prescription) -> OffTarget:
+    """Return the volumes that fell outside the field, and inside it off every planned line.
 
     A strip is split into elements of at most 0.1 m across, each judged at its exact point at
     every sample that something falls.
     """
-    total_ml = 0.0
+    outside_ml, off_line_ml = 0.0, 0.0
+    lines = strips[0].track.planned
+    planned = None if lines is None else lines.ground
+    shapely.prepare(planned)
     for strip in strips:
         track = strip.track
         samples = _doubtful(strip)
@@ -259,9 +275,13 @@ def off_target_ml(strips: Sequence[Strip], prescription: Prescription) -> float:
         time_s = 0.5 * (track.time_s[samples] + track.time_s[samples + 1])
         count = int(np.ceil(track.width_m / ELEMENT_M - 1e-9))
         for offset in (np.arange(count) + 0.5) / count - 0.5:
-            outside = ~track.inside(prescription, time_s, float(offset * track.width_m))
-            total_ml += float(drops[outside].sum()) / count
-    return total_ml
+            place = track.places(time_s).beside(float(offset * track.width_m))
+            inside = in_field(prescription, *place)
+            outside_ml += float(drops[~inside].sum()) / count
+            if planned is not None:
+                off_line = inside & ~shapely.contains_xy(planned, *place)
+                off_line_ml += float(drops[off_line].sum()) / count
+    return OffTarget(outside_ml, off_line_ml)
 
 
 def _doubtful(strip: Strip) -> Ints:

@@ -19,7 +19,7 @@ from analysis.border import (
     border_crossings,
     held_by_border,
     margin_bound_m,
-    off_target_ml,
+    off_target,
 )
 from analysis.changes import Run, find_runs, stretches_of
 from analysis.dose import (
@@ -143,6 +143,7 @@ class Changes:
     apart: int
     missed: int
     off_target_ml: float
+    off_line_ml: float
     applied_ml: float
     steps: tuple[Step, ...]
 
@@ -169,6 +170,7 @@ class Evaluation:
     border_margin_m: Distances
     border_bound_m: float | None
     off_target_ml: float
+    off_line_ml: float
     gap_m2: float
     overlap_m2: float
     volume_error_percent: float | None
@@ -195,6 +197,7 @@ class Evaluation:
             "starting_accuracy_percent": self.starting_accuracy_percent,
             "border_margin_m": asdict(self.border_margin_m) | {"bound": self.border_bound_m},
             "off_target_ml": self.off_target_ml,
+            "off_line_ml": self.off_line_ml,
             "missed": self.missed,
             "apart": self.apart,
             "gap_m2": self.gap_m2,
@@ -242,6 +245,7 @@ def evaluate_strips(record: FlightRecord, strips: Sequence[Strip]) -> Evaluation
         border_margin_m=Distances.of(crossing.margin_m for crossing in crossings),
         border_bound_m=margin_bound_m(crossings, position_sd_m=record.position_sd_m),
         off_target_ml=changes.off_target_ml,
+        off_line_ml=changes.off_line_ml,
         gap_m2=sum(switch.gap_m2 for switch in switches),
         overlap_m2=sum(switch.overlap_m2 for switch in switches),
         volume_error_percent=volume_error,
@@ -265,11 +269,13 @@ def _changes(
 ) -> Changes:
     every = [step for each in steps for step in each]
     inside = [step for step in every if not step.change.border]
+    off = off_target(strips, record.prescription)
     return Changes(
         lag_distance_m=Distances.of(step.lag_distance_m for step in inside),
         apart=sum(step.verdict not in (Verdict.MEASURED, Verdict.MISSED) for step in inside),
         missed=sum(step.verdict is Verdict.MISSED for step in every),
-        off_target_ml=off_target_ml(strips, record.prescription),
+        off_target_ml=off.outside_ml,
+        off_line_ml=off.off_line_ml,
         applied_ml=float((record.volume_ml[-1] - record.volume_ml[0]).sum()),
         steps=tuple(every),
     )

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from companion.core.options.lines import MOVING_M_S
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from analysis.flight_record import FlightRecord
     from companion.core.options.lines import Lines
     from companion.core.prescription import Prescription
@@ -118,6 +120,9 @@ class PlannedLines:
 
     def __init__(self, record: FlightRecord, lines: Lines) -> None:
         self._pieces = np.array(lines.pieces)
+        self._reach_m = lines.aside_m + max(
+            abs(valve.right_m) + 0.5 * valve.width_m for valve in record.boom.valves
+        )
         self.visits = _visits(record, lines, self._pieces)
 
     def flown(self, time_s: Floats, east_m: Floats, north_m: Floats) -> Bools:
@@ -129,6 +134,29 @@ class PlannedLines:
             along = ue * (east_m[at] - x0) + un * (north_m[at] - y0)
             found[at[(-before <= along) & (along <= length + after)]] = True
         return found
+
+    def ways(self, record: FlightRecord) -> Iterator[shapely.LineString]:
+        """Yield each visit's part of its line: all of it, but for what it stopped short of.
+
+        An autopilot cuts corners, and leaves the end of a line to be flown: it was to be treated.
+        """
+        for visit in self.visits:
+            _, x0, y0, ue, un, length, _, _ = self._pieces[visit.piece]
+            ends_s = (visit.start_s, visit.end_s)
+            x, y = (
+                np.interp(ends_s, record.time_s, each) for each in (record.east_m, record.north_m)
+            )
+            low, high = sorted((ue * (x - x0) + un * (y - y0)).tolist())
+            low, high = low if low > TURN_M else 0.0, high if high < length - TURN_M else length
+            yield shapely.LineString([(x0 + ue * m, y0 + un * m) for m in (low, high)])
+
+    @property
+    def ground(self) -> shapely.Geometry:
+        """Return the ground of all lines, flown or not, as far aside as one counts as flown."""
+        _, x0, y0, ue, un, length, _, _ = self._pieces.T
+        ends = np.column_stack([x0, y0, x0 + ue * length, y0 + un * length]).reshape(-1, 2, 2)
+        strips = shapely.buffer(shapely.linestrings(ends), self._reach_m, cap_style="flat")
+        return shapely.union_all(strips)
 
 
 def _visits(record: FlightRecord, lines: Lines, pieces: Floats) -> list[Visit]:
@@ -325,11 +353,6 @@ class Track:
         if self.planned is None:
             return np.ones(len(places.time_s), dtype=np.bool_)
         return self.planned.flown(places.time_s, places.east_m, places.north_m)
-
-    def inside(self, prescription: Prescription, time_s: Floats, right_m: float = 0.0) -> Bools:
-        """Return when the strip's point `right_m` of its centre is where it may spray."""
-        places = self.places(time_s)
-        return in_field(prescription, *places.beside(right_m)) & self.on_line(places)
 
 
 def _inside_by_pieces(

@@ -139,8 +139,9 @@ def fly_lines(result: dict[str, Any]) -> Iterator[str]:
         f"spraying accuracy {_number(flight['spraying_accuracy_percent'], 2)} %"
     )
     yield (
-        f"applied {flight['applied_ml'] / 1000.0:.3f} L, off target {flight['off_target_ml']:.1f} "
-        f"mL, on ground of rate 0 {flight['zero_rate_ml']:.1f} mL"
+        f"applied {flight['applied_ml'] / 1000.0:.3f} L, of it {flight['off_target_ml']:.1f} mL "
+        f"outside the field, {flight['off_line_ml']:.1f} mL in it beside planned lines, "
+        f"{flight['zero_rate_ml']:.1f} mL on ground of rate 0"
     )
     for drops in flight["droplets"]:
         yield (

@@ -24,6 +24,7 @@ OPEN_FROM = 0.5
 # Pulses are no openings: flows are means over about a period.
 MEAN_S = 0.09
 FINE_M = 0.05
+PARTS = 4
 PER_L_HA = 10.0  # mL/m2 to L/ha
 
 
@@ -121,15 +122,9 @@ class Field:
     ) -> Field:
         """Return the field of a map file; the outline is that of all zones."""
         zones = [(shape, float(said[rate])) for shape, said in ground_of(map_file, origin_deg)]
-        lines = (
-            []
-            if lines_file is None
-            else [
-                shape
-                for shape, _ in ground_of(lines_file, origin_deg)
-                if shape.geom_type == "LineString"
-            ]
-        )
+        every = [] if lines_file is None else ground_of(lines_file, origin_deg)
+        # The ways between passes stand there too.
+        lines = [shape for shape, said in every if said.get("kind") == "spray"]
         outline = shapely.union_all([shape for shape, _ in zones], grid_size=1e-4)
         return Field(zones=zones, outline=outline, lines=lines)
 
@@ -260,11 +255,15 @@ def points_of(truth: Truth) -> tuple[Floats, Floats]:
     given = np.diff(truth.volume_ml, axis=0)
     for valve in range(given.shape[1]):
         wet = np.flatnonzero(given[:, valve] > 0.0)
-        left, right = (0.5 * (side[1:] + side[:-1])[wet] for side in truth.sides(valve))
         count = int(np.ceil(truth.width_m[valve] / FINE_M))
-        for share in (np.arange(count) + 0.5) / count:
-            places.append(left + share * (right - left))
-            drops.append(given[wet, valve] / count)
+        # Within a step too: a cell of a metre is twenty steps long, and one more is 5 %.
+        for part in (np.arange(PARTS) + 0.5) / PARTS:
+            left, right = (
+                (side[:-1] + part * np.diff(side, axis=0))[wet] for side in truth.sides(valve)
+            )
+            for share in (np.arange(count) + 0.5) / count:
+                places.append(left + share * (right - left))
+                drops.append(given[wet, valve] / count / PARTS)
     return np.concatenate(places), np.concatenate(drops)
 
 
@@ -304,13 +303,13 @@ def doses_of(
 ) -> Doses:
     """Return what fell on each cell of a grid, over all flights, with cells cut at the outline.
 
-    Dose is over the ground of the cell that the boom came over: the rest is nobody's dose.
+    Dose is over the ground of the cell under a line that was flown, or under the boom where there
+    are no lines: the rest is nobody's dose.
     """
     rows, columns = shape
     per = max(round(cell_m / 0.1), 1)
     fine_m = cell_m / per
     volume = np.zeros(rows * columns)
-    over = np.zeros((rows * per) * (columns * per), dtype=np.bool_)
 
     def number(xy: Floats, size_m: float, count: tuple[int, int]) -> NDArray[np.int64]:
         column = np.floor((xy[:, 0] - west_m) / size_m).astype(np.int64)
@@ -323,15 +322,12 @@ def doses_of(
         cells = number(places, cell_m, shape)
         inside = (cells >= 0) & shapely.contains_xy(ground.outline, places)
         volume += np.bincount(cells[inside], weights=drops[inside], minlength=rows * columns)
-        for valve in range(len(truth.right_m)):
-            left, right = truth.sides(valve)
-            for share in np.linspace(0.02, 0.98, int(np.ceil(truth.width_m[valve] / 0.05))):
-                fine = number(left + share * (right - left), fine_m, (rows * per, columns * per))
-                over[fine[fine >= 0]] = True
-    row, column = np.divmod(np.arange(len(over)), columns * per)
+    row, column = np.divmod(np.arange(rows * columns * per**2), columns * per)
     xy = np.column_stack([west_m + (column + 0.5) * fine_m, south_m + (row + 0.5) * fine_m])
     rates = ground.rates_at(xy)
-    counts = over & np.isfinite(rates)
+    passed = passed_of(flights, ground)
+    shapely.prepare(passed)
+    counts = shapely.contains_xy(passed, xy) & np.isfinite(rates)
     coarse = (row // per) * columns + column // per
     area = np.bincount(coarse[counts], minlength=rows * columns) * fine_m**2
     asked = np.bincount(coarse[counts], weights=rates[counts], minlength=rows * columns)

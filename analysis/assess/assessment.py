@@ -22,8 +22,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from analysis.assess.breakdowns import Breakdowns, breakdowns, ways_between
-from analysis.assess.causes import Cause, Causes, causes_of
+from analysis.assess.causes import Causes, causes_of
 from analysis.assess.cell_maps import CellMaps, cell_maps
+from analysis.assess.ground import Ground, Treated, ground_of, treated_of
 from analysis.dose import flow_samples, misapplied_parts
 from analysis.evaluation import Changes, Evaluation, changes_of, evaluate_strips
 from analysis.flown.applied_record import STEP_S, Source, modelled_ml, record_of
@@ -152,7 +153,7 @@ REFILL_L = 0.5
 class Balance:
     """Litres of a flight; None where there is no such sensor, or it said too little.
 
-    `prescribed_l` is the integral of the prescription over the ground that the strips passed.
+    `prescribed_l` is the integral of the prescription over the ground that was treated, once.
     Percentages are of what stands second in their name. `meter_spread_percent` is one standard
     deviation of the meter as the configuration of the fault detection has it.
     """
@@ -176,9 +177,8 @@ class Balance:
         return asdict(self)
 
 
-def balance_of(flight: AppliedFlight, strips: Sequence[Strip], model_ml: float) -> Balance:
-    """Return the balance of a flight whose model put out `model_ml`."""
-    asked_l = sum(float(strip.asked_ml[-1]) for strip in strips) / ML_PER_L
+def balance_of(flight: AppliedFlight, model_ml: float, asked_l: float) -> Balance:
+    """Return the balance of a flight whose model put out `model_ml` where `asked_l` were asked."""
     model_l = model_ml / ML_PER_L
     meter_l = None
     if flight.meter_ml is not None:
@@ -262,6 +262,7 @@ class Assessment:
     breakdowns: Breakdowns
     cells: CellMaps | None
     causes: Causes
+    ground: Ground
     balance: Balance
     durations: Durations
     counts: Mapping[str, int]
@@ -284,12 +285,19 @@ class Assessment:
             "intervals": {name: each.as_json() for name, each in self.intervals.items()},
             "breakdowns": self.breakdowns.as_json(),
             "cells": None if self.cells is None else self.cells.as_json(),
-            "causes": self.causes.as_json(),
+            "causes": {**self.causes.as_json(), **_judged(self.cells)},
             "balance": self.balance.as_json(),
             "durations": self.durations.as_json(),
             "counts": dict(self.counts),
             "notes": list(self.notes),
         }
+
+
+def _judged(cells: CellMaps | None) -> dict[str, Any]:
+    return {
+        "judged_m2": 0.0 if cells is None else cells.judged_m2,
+        "within_10_percent": None if cells is None else cells.within_percent,
+    }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -298,7 +306,8 @@ class Essentials:
 
     evaluation: Changes
     worst: Worst
-    causes: Causes
+    cells: CellMaps | None
+    ground: Ground
     balance: Balance
 
 
@@ -307,11 +316,13 @@ def essentials_of(flight: AppliedFlight) -> Essentials:
     record = record_of(flight)
     strips = strips_of(record)
     changes = changes_of(record, strips)
+    ground = ground_of(flight, record, strips, treated_of(flight))
     return Essentials(
         evaluation=changes,
         worst=worst_of(flight, changes.steps),
-        causes=causes_of(flight, record, strips, changes.steps),
-        balance=balance_of(flight, strips, changes.applied_ml),
+        cells=cell_maps(record, strips, duties_of(flight, record.time_s), flown=ground.own),
+        ground=ground,
+        balance=balance_of(flight, changes.applied_ml, ground.asked_l),
     )
 
 
@@ -321,6 +332,7 @@ def assess(
     source: Source = "model",
     step_s: float = STEP_S,
     cell_m: float | None = None,
+    treated: Treated | None = None,
 ) -> Assessment:
     """Return everything of a flight; EvaluationError where it has nothing to evaluate."""
     record = record_of(flight, step_s=step_s, source=source)
@@ -330,6 +342,7 @@ def assess(
     if source != "model":
         volume_ml = modelled_ml(flight, record.time_s)
         modelled = float((volume_ml[-1] - volume_ml[0]).sum())
+    ground = ground_of(flight, record, strips, treated or treated_of(flight))
     return Assessment(
         flight=flight,
         source=source,
@@ -339,9 +352,12 @@ def assess(
         worst=worst_of(flight, evaluation.steps),
         intervals=_intervals(evaluation, strips),
         breakdowns=breakdowns(evaluation, strips),
-        cells=cell_maps(record, strips, duties_of(flight, record.time_s), cell_m=cell_m),
-        causes=causes_of(flight, record, strips, evaluation.steps),
-        balance=balance_of(flight, strips, modelled),
+        cells=cell_maps(
+            record, strips, duties_of(flight, record.time_s), cell_m=cell_m, flown=ground.own
+        ),
+        causes=causes_of(flight, strips, evaluation.steps, ground),
+        ground=ground,
+        balance=balance_of(flight, modelled, ground.asked_l),
         durations=_durations(flight),
         counts=_counts(flight, evaluation),
         notes=tuple(_notes(flight, source)),
@@ -451,13 +467,18 @@ By = Literal["flow meter", "model", "nothing"]
 class Figures:
     """What was applied, where, and how well; None where nothing is known of it.
 
-    `applied_by` says what the litres are known by. `missed_m2` is ground that the aircraft passed
-    and left bare, `untreated_m2` all ground with a rate that this flight did not treat.
-    `worst_m` is a bound: `analysis.assess.assessment`.
+    `applied_by` says what the litres are known by; `metered_l` and `modelled_l` stand beside them.
+    `prescribed_l` is for the ground treated, as `area_ha` is. `untreated_m2` is all ground with a
+    rate that this flight did not treat, `untreated_percent` its share of such ground; `missed_m2`
+    of it lay under lines that were flown, `left_m2` is other flights'. What fell in the field, off
+    the planned lines, is `off_line_ml`. `worst_m` is a bound over `lag_count` of
+    `change_count` changes: `analysis.assess.assessment`.
     """
 
     applied_l: float | None
     applied_by: By | None
+    metered_l: float | None
+    modelled_l: float | None
     prescribed_l: float | None
     off_percent: float | None
     area_ha: float | None
@@ -466,12 +487,16 @@ class Figures:
     within_10_percent: float | None
     mean_lag_m: float | None
     lag_count: int
+    change_count: int
     worst_m: float | None
     worst_why_not: str
     outside_ml: float | None
+    off_line_ml: float | None
     missed_m2: float | None
+    left_m2: float | None
     doubled_m2: float | None
     untreated_m2: float | None
+    untreated_percent: float | None
 
     def as_json(self) -> dict[str, Any]:
         """Return all figures."""
@@ -483,6 +508,8 @@ def nothing_sprayed(area_ha: float | None, *, is_known: bool) -> Figures:
     return Figures(
         applied_l=0.0 if is_known else None,
         applied_by="nothing" if is_known else None,
+        metered_l=None,
+        modelled_l=None,
         prescribed_l=None,
         off_percent=None,
         area_ha=area_ha if is_known else None,
@@ -491,12 +518,16 @@ def nothing_sprayed(area_ha: float | None, *, is_known: bool) -> Figures:
         within_10_percent=None,
         mean_lag_m=None,
         lag_count=0,
+        change_count=0,
         worst_m=None,
         worst_why_not="nothing was sprayed" if is_known else "too little can be read",
         outside_ml=None,
+        off_line_ml=None,
         missed_m2=None,
+        left_m2=None,
         doubled_m2=None,
         untreated_m2=None,
+        untreated_percent=None,
     )
 
 
@@ -509,13 +540,16 @@ def figures_of(
     """
     if assessment is None or assessment.evaluation.applied_ml <= 0.0:
         return nothing_sprayed(area_ha, is_known=is_whole)
-    evaluation, balance, causes = assessment.evaluation, assessment.balance, assessment.causes
+    evaluation, balance, ground = assessment.evaluation, assessment.balance, assessment.ground
+    inside = [step for step in evaluation.steps if not step.change.border]
     metered = balance.meter_l is not None
     applied_l = balance.meter_l if balance.meter_l is not None else balance.model_l
     asked_l = balance.prescribed_l
     return Figures(
         applied_l=applied_l,
         applied_by="flow meter" if metered else "model",
+        metered_l=balance.meter_l,
+        modelled_l=balance.model_l,
         prescribed_l=asked_l,
         off_percent=(
             balance.meter_to_prescribed_percent if metered else balance.model_to_prescribed_percent
@@ -523,13 +557,19 @@ def figures_of(
         area_ha=area_ha,
         mean_rate_l_ha=applied_l / area_ha if area_ha > 0.0 else None,
         asked_rate_l_ha=asked_l / area_ha if area_ha > 0.0 else None,
-        within_10_percent=causes.within_percent,
+        within_10_percent=None if assessment.cells is None else assessment.cells.within_percent,
         mean_lag_m=evaluation.lag_distance_m.mean_abs,
         lag_count=evaluation.lag_distance_m.count,
+        change_count=len(inside),
         worst_m=assessment.worst.bound_m,
         worst_why_not=assessment.worst.why_not,
         outside_ml=evaluation.off_target_ml,
-        missed_m2=causes.skipped_m2 + causes.by_cause[Cause.INHIBIT],
-        doubled_m2=causes.doubled_m2,
-        untreated_m2=causes.untreated_m2,
+        off_line_ml=evaluation.off_line_ml,
+        missed_m2=ground.missed_m2,
+        left_m2=ground.untreated_m2 - ground.missed_m2,
+        doubled_m2=ground.doubled_m2,
+        untreated_m2=ground.untreated_m2,
+        untreated_percent=(
+            100.0 * ground.untreated_m2 / ground.rated_m2 if ground.rated_m2 > 0.0 else None
+        ),
     )

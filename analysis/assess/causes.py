@@ -12,13 +12,10 @@ import re
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
-import shapely
 
-from analysis.assess.ground_elements import SquareGrid, slices_of, summed
-from analysis.changes import SPEED_MIN_M_S, ground_rates
+from analysis.changes import SPEED_MIN_M_S
 from analysis.flown.modelled_flow import ML_S_PER_L_MIN
 from analysis.holds import CLEAR_M
 from analysis.lag import Verdict
@@ -29,7 +26,7 @@ from companion.core.nozzle import is_override
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from analysis.flight_record import FlightRecord
+    from analysis.assess.ground import Ground
     from analysis.flown.applied_flight import AppliedFlight
     from analysis.lag import Step
     from analysis.strips import Strip
@@ -62,13 +59,13 @@ class Cause(StrEnum):
 class Causes:
     """Areas in square metres.
 
-    `judged_m2` is the ground that the strips passed where something was prescribed or fell, with
-    `skipped_m2` that lies between passes; `off_m2` is the part of it that is off, with what was
-    treated again. `untreated_m2` is all ground of the field with a rate that no open strip passed,
-    flown over or not: of a job in several flights most of it belongs to the others.
+    `off_m2` is what was off along the strips, with what was treated again and `skipped_m2`, what
+    lies between passes; `passed_m2` is what the strips went over, twice where two did.
+    `untreated_m2` is all ground of the field with a rate that no open strip passed, flown over or
+    not: of a job in several flights most of it belongs to the others.
     """
 
-    judged_m2: float
+    passed_m2: float
     off_m2: float
     by_cause: Mapping[Cause, float]
     by_inhibit: Mapping[str, float]
@@ -76,20 +73,11 @@ class Causes:
     skipped_m2: float
     untreated_m2: float
 
-    @property
-    def within_percent(self) -> float | None:
-        """Return the share of the ground that got its rate within 10 %."""
-        if not self.judged_m2 > 0.0:
-            return None
-        return 100.0 * (1.0 - min(self.off_m2 / self.judged_m2, 1.0))
-
     def as_json(self) -> dict[str, Any]:
         """Return areas, and the shares of the ground that is off."""
         whole = self.off_m2 if self.off_m2 > 0.0 else 1.0
         return {
-            "judged_m2": self.judged_m2,
             "off_m2": self.off_m2,
-            "within_10_percent": self.within_percent,
             "area_m2": {cause.value: area for cause, area in self.by_cause.items()},
             "share": {cause.value: area / whole for cause, area in self.by_cause.items()},
             "inhibit_m2": dict(self.by_inhibit),
@@ -100,15 +88,15 @@ class Causes:
 
 
 def causes_of(
-    flight: AppliedFlight, record: FlightRecord, strips: Sequence[Strip], steps: Sequence[Step]
+    flight: AppliedFlight, strips: Sequence[Strip], steps: Sequence[Step], ground: Ground
 ) -> Causes:
     """Return where the ground that is off comes from."""
     area = dict.fromkeys(Cause, 0.0)
     inhibits: dict[str, float] = {}
-    judged_m2 = 0.0
+    passed_m2 = 0.0
     for strip in strips:
         marks = marks_of(strip, flight.setup)
-        judged_m2 += float(marks.area_m2.sum())
+        passed_m2 += float(marks.area_m2.sum())
         off = _is_off(marks)
         own = [step for step in steps if step.change.valve == strip.track.valve]
         for cause, where in _sorted(flight, marks, off, own):
@@ -117,11 +105,10 @@ def causes_of(
             if cause is Cause.INHIBIT:
                 for reason, its in by_inhibit(flight, marks, where).items():
                     inhibits[reason] = inhibits.get(reason, 0.0) + its
-    ground = treated_ground(record, strips)
     area[Cause.OVERLAP] = ground.doubled_m2
     area[Cause.SKIP] += ground.between_m2
     return Causes(
-        judged_m2=judged_m2 + ground.between_m2,
+        passed_m2=passed_m2,
         off_m2=sum(area.values()),
         by_cause=area,
         by_inhibit=inhibits,
@@ -291,149 +278,6 @@ def by_inhibit(flight: AppliedFlight, marks: Marks, where: Bools) -> dict[str, f
         name = reason or then or "a condition that had just ended"
         found[name] = found.get(name, 0.0) + area
     return found
-
-
-# Which ground was treated, treated again, or left out between passes: counted on small squares.
-#
-# Squares of half a metre: what is narrower than a quarter of a metre (the noise with which an
-# aircraft holds its line) is neither a gap nor an overlap.
-
-CELL_M = 0.5
-PIECE_M = 0.125
-CELLS_MAX = 4_000_000
-# A slice was sprayed where it got this part of what was prescribed there.
-WET_FROM = 0.10
-DOUBLED_FROM = 1.5
-LEFT_OUT_BELOW = 0.5
-# Less of a square inside the border is nothing; more squares on it than this go by their middle.
-SHARE_MIN = 0.02
-EDGE_CELLS_MAX = 50_000
-KEPT_CELLS_MAX = 200_000
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TreatedGround:
-    """Areas in square metres; `between_m2` is the untreated ground with treated on both sides."""
-
-    treated_m2: float
-    doubled_m2: float
-    between_m2: float
-    untreated_m2: float
-
-
-def treated_ground(record: FlightRecord, strips: Sequence[Strip]) -> TreatedGround:
-    """Return how the field was covered."""
-    prescription = record.prescription
-    if prescription.field.is_empty:
-        return TreatedGround(treated_m2=0.0, doubled_m2=0.0, between_m2=0.0, untreated_m2=0.0)
-    west, south, east, north = prescription.bounds_m
-    cell_m = max(CELL_M, ((east - west) * (north - south) / CELLS_MAX) ** 0.5)
-    grid = SquareGrid.over((west, south, east, north), cell_m)
-    covered = np.zeros(grid.rows * grid.columns + 1)
-    passed = np.zeros(grid.rows * grid.columns + 1)
-    for strip in strips:
-        slices = slices_of(strip, PIECE_M)
-        active = np.flatnonzero((slices.given_ml > 1e-9) | (slices.asked_ml > 0.0))
-        wet = np.where(slices.given_ml > WET_FROM * slices.asked_ml, slices.area_m2, 0.0)
-        dry = slices.area_m2 - wet
-        for total, each in zip(
-            (covered, passed), summed(grid, slices, PIECE_M, [wet, dry], active), strict=True
-        ):
-            total += each
-    shape = (grid.rows, grid.columns)
-    area = cell_m * cell_m
-    share, east_m, north_m = _known_shares(record.prescription, grid)
-    # Of a cell that the border goes through, the part inside is the whole.
-    ground_m2 = area * np.maximum(share, SHARE_MIN)
-    times = covered[:-1].reshape(shape) / ground_m2
-    under = passed[:-1].reshape(shape) / ground_m2
-    bare = (times < LEFT_OUT_BELOW) & (share >= SHARE_MIN)
-    open_ground = _rated(record, bare, east_m, north_m)
-    # What a strip passed with its valve closed is judged along the strip.
-    missed = open_ground & (times + under < LEFT_OUT_BELOW)
-    closed = _closed(times + under >= LEFT_OUT_BELOW, record.boom.width_m / cell_m)
-    return TreatedGround(
-        treated_m2=float(share[times >= LEFT_OUT_BELOW].sum()) * area,
-        doubled_m2=float(((times - 1.0) * share)[times > DOUBLED_FROM].sum()) * area,
-        between_m2=float(share[missed & closed].sum()) * area,
-        untreated_m2=float(share[open_ground].sum()) * area,
-    )
-
-
-_SHARES: WeakKeyDictionary[Prescription, tuple[SquareGrid, tuple[Floats, Floats, Floats]]] = (
-    WeakKeyDictionary()
-)
-
-
-def _known_shares(prescription: Prescription, grid: SquareGrid) -> tuple[Floats, Floats, Floats]:
-    """Return `_shares`, which flights over the same map have in common; small ones are kept."""
-    known = _SHARES.get(prescription)
-    if known is not None and known[0] == grid:
-        return known[1]
-    found = _shares(prescription, grid)
-    if grid.rows * grid.columns <= KEPT_CELLS_MAX:
-        _SHARES[prescription] = (grid, found)
-    return found
-
-
-def _shares(prescription: Prescription, grid: SquareGrid) -> tuple[Floats, Floats, Floats]:
-    """Return how much of each square lies in the field, and a place in that part of it.
-
-    A square that the border goes through counts with its geometry: half a square beyond a slanted
-    edge is no ground that was left out. Others are in or out by their middle.
-    """
-    shape = (grid.rows, grid.columns)
-    row, column = np.indices(shape)
-    east_m: Floats = grid.west_m + grid.cell_m * (column.astype(np.float64) + 0.5)
-    north_m: Floats = grid.south_m + grid.cell_m * (row.astype(np.float64) + 0.5)
-    share = prescription.inside(east_m.ravel(), north_m.ravel()).astype(np.float64).reshape(shape)
-    # Steps short enough that no square of any size worth counting is stepped over.
-    edge = shapely.segmentize(prescription.field.boundary, grid.cell_m / 8.0)
-    cells = np.unique(grid.cells_of(*shapely.get_coordinates(edge).T))
-    cells = cells[cells < grid.rows * grid.columns]
-    if len(cells) > EDGE_CELLS_MAX:
-        return share, east_m, north_m
-    at = np.unravel_index(cells, shape)
-    half_m = 0.5 * grid.cell_m
-    boxes = shapely.box(
-        east_m[at] - half_m, north_m[at] - half_m, east_m[at] + half_m, north_m[at] + half_m
-    )
-    inside = shapely.intersection(prescription.field, boxes)
-    share[at] = np.minimum(shapely.area(inside) / grid.cell_m**2, 1.0)
-    middle = shapely.point_on_surface(inside)
-    known = ~shapely.is_empty(middle)
-    where = tuple(each[known] for each in at)
-    east_m[where], north_m[where] = shapely.get_x(middle[known]), shapely.get_y(middle[known])
-    return share, east_m, north_m
-
-
-def _rated(record: FlightRecord, asked: Bools, east_m: Floats, north_m: Floats) -> Bools:
-    """Return which of some squares have something prescribed at their place."""
-    found = np.zeros(asked.shape, dtype=np.bool_)
-    found[asked] = ground_rates(record.prescription, east_m[asked], north_m[asked]) > 0.0
-    return found
-
-
-def _closed(treated: Bools, width: float) -> Bools:
-    """Return the treated squares and what lies between them, up to `width` squares apart."""
-    reach = max(int(width / 2.0), 1)
-    padded = np.pad(treated, 2 * reach)
-    grown = _box_sum(padded.astype(np.float64), reach) > 0.5
-    shrunk = _box_sum((~grown).astype(np.float64), reach) < 0.5
-    return shrunk[2 * reach : -2 * reach, 2 * reach : -2 * reach]
-
-
-def _box_sum(values: Floats, reach: int) -> Floats:
-    """Return the sum over the square of `reach` to each side."""
-    for axis in (0, 1):
-        total = np.cumsum(values, axis=axis)
-        count = values.shape[axis]
-        high = np.minimum(np.arange(count) + reach, count - 1)
-        low = np.arange(count) - reach - 1
-        below = np.take(total, np.maximum(low, 0), axis=axis)
-        outside = np.expand_dims(low < 0, 1 - axis)
-        values = np.take(total, high, axis=axis) - np.where(outside, 0.0, below)
-    return values
 
 
 # What the causes of wrong doses are looked for in: one strip, mark by mark.

@@ -2,24 +2,31 @@
 
 As its Figs. 10, 15, 16 and 17: maps on the map's own grid (else square cells of a stated size),
 relative error with small cells left blank, duty, histogram with mean and standard deviation. What
-is measured here is the record's volume, over the ground of the field that the strips passed in each
-cell, but for what they spared as treated before. What was commanded is the map's rate where a cell
-lies in one zone, else the mean of what the strips were to spray there.
+is measured is a dose: the sum of all that fell on a cell, over the ground of the field in it that
+the strips came over, once or often, or were to: the ends of a line that was flown are bare ground,
+and no ground beside it. What was commanded is the map's rate where a cell lies in one zone, else
+the mean of what the strips were to spray there.
 """
 
 from __future__ import annotations
 
+import math
+from copy import copy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from analysis.assess.ground import within
 from analysis.assess.ground_elements import Grid, Slices, SquareGrid, slices_of, summed
-from analysis.changes import rates_of_squares
+from analysis.changes import ground_rates, rates_of_squares
+from analysis.track import in_field
 from companion.core.nozzle import flow_for_rate
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from shapely.geometry.base import BaseGeometry
 
     from analysis.flight_record import FlightRecord
     from analysis.strips import Strip
@@ -79,12 +86,17 @@ class Histogram:
 
 # P2 leaves cells blank whose commanded flow is below this part of the highest.
 BLANK_BELOW = 0.10
+OFF_BY = 0.10
 # A cell of which less than this was passed says little about a cell.
 PASSED_MIN = 0.10
 PIECES_PER_CELL = 5
 # Pieces of ground are not longer: one that lies across a boundary counts for one of its sides.
 PIECE_MAX_M = 0.2
-CELLS_MAX = 2_000_000
+CELLS_MAX = 1_000_000
+# The ground that strips came over is counted in parts of a cell, so many in all.
+PARTS_MAX = 4_000_000
+# Samples are not spaced as parts are: of one wholly under a strip so much is met at least.
+TAKEN_FROM = 0.3
 L_HA_PER_ML_M2 = 10.0
 
 
@@ -94,8 +106,9 @@ class CellMaps:
 
     `corner_east_m` and `corner_north_m` are (rows + 1, columns + 1), in the flight's frame: what
     `pcolormesh` takes. `commanded_l_ha` is what was prescribed where the strips passed, `passes`
-    how often the ground was passed on average, `duty` that of the orders in force. All are means
-    over the field's ground: a cell that it has half of is judged by that half.
+    how often the ground was passed on average, `duty` that of the orders in force, `ground_m2` what
+    the strips came over. All are of the field's ground: a cell that it has half of is judged by
+    that half.
     """
 
     source: Literal["map", "squares"]
@@ -104,6 +117,7 @@ class CellMaps:
     corner_north_m: Floats
     commanded_l_ha: Floats
     measured_l_ha: Floats
+    ground_m2: Floats
     passes: Floats
     duty: Floats
     speed_m_s: Floats
@@ -127,6 +141,20 @@ class CellMaps:
         error[counts] = 100.0 * self.deviation_l_ha[counts] / asked[counts]
         return error
 
+    @property
+    def judged_m2(self) -> float:
+        """Return the ground that had a rate and was passed."""
+        return float(self.ground_m2[self.commanded_l_ha > 0.0].sum())
+
+    @property
+    def within_percent(self) -> float | None:
+        """Return the share of that ground, cell by cell, that got its rate within 10 %."""
+        if not self.judged_m2 > 0.0:
+            return None
+        asked = self.commanded_l_ha
+        near = (asked > 0.0) & (np.abs(self.deviation_l_ha) <= OFF_BY * asked)
+        return 100.0 * float(self.ground_m2[near].sum()) / self.judged_m2
+
     def as_json(self) -> dict[str, Any]:
         """Return what the maps say in sum; the maps themselves are arrays."""
         both = (self.histogram_l_ha, self.histogram_l_min)
@@ -146,11 +174,13 @@ def cell_maps(
     duties: Sequence[Floats],
     *,
     cell_m: float | None = None,
+    flown: BaseGeometry | None = None,
 ) -> CellMaps | None:
     """Return the maps of a flight; None where no strip came over the field.
 
     `duties` are those in force at every sample of the record, for each strip. With `cell_m` the
-    cells are squares of that size, else the map's own, or squares of a strip's width.
+    cells are squares of that size, else the map's own, or squares of a strip's width. `flown` is
+    the ground of the lines that were flown, where there are lines.
     """
     bounds = _bounds(strips)
     if bounds is None:
@@ -170,9 +200,11 @@ def cell_maps(
         source = "squares"
         corners = grid.corners()
     sums = _sums(grid, strips, duties, min(size_m / PIECES_PER_CELL, PIECE_MAX_M))
+    fallen = _fallen(grid, strips, record.prescription, corners, flown)
     square_m = size_m if source == "squares" else None
-    commanded = _commanded(record.prescription, sums, corners, square_m)
-    return _maps(commanded, sums, corners, source, size_m, record.boom.width_m)
+    passed = fallen[0] > PASSED_MIN * _cell_areas(*corners)
+    commanded = _commanded(record.prescription, sums, corners, square_m, passed)
+    return _maps(commanded, sums, fallen, corners, source, size_m, record.boom.width_m)
 
 
 def _bounds(strips: Sequence[Strip]) -> tuple[float, float, float, float] | None:
@@ -202,46 +234,92 @@ class _Sums:
     area: Floats
     inside: Floats
     asked_ml: Floats
-    given_ml: Floats
     duty: Floats
     speed: Floats
 
 
 def _sums(grid: Grid, strips: Sequence[Strip], duties: Sequence[Floats], piece_m: float) -> _Sums:
-    """Return areas, asked and given volume, area x duty and area x speed of each cell."""
-    totals = np.zeros((6, grid.rows * grid.columns + 1))
+    """Return areas, asked volume, area x duty and area x speed of each cell, pass by pass."""
+    totals = np.zeros((5, grid.rows * grid.columns + 1))
     for strip, duty in zip(strips, duties, strict=True):
         slices = slices_of(strip, piece_m)
-        # Closed over ground that was treated before, a strip takes no part: what fell there before
-        # is what came, not the mean of that and nothing.
-        passed = slices.inside & ~strip.spared_at(slices.time_s)
-        chosen = np.flatnonzero(passed | (slices.given_ml > 1e-9))
+        chosen = _taking_part(strip, slices)
         totals += summed(grid, slices, piece_m, _values(slices, duty), chosen)
-    area, inside, asked_ml, given_ml, duty_m2, speed = (
+    area, inside, asked_ml, duty_m2, speed = (
         total[:-1].reshape(grid.rows, grid.columns) for total in totals
     )
-    return _Sums(
-        area=area, inside=inside, asked_ml=asked_ml, given_ml=given_ml, duty=duty_m2, speed=speed
+    return _Sums(area=area, inside=inside, asked_ml=asked_ml, duty=duty_m2, speed=speed)
+
+
+def _taking_part(strip: Strip, slices: Slices) -> Ints:
+    """Return the slices that count: not where nothing was asked, as all was treated before."""
+    passed = slices.inside & ~strip.spared_at(slices.time_s)
+    return np.flatnonzero(passed | (slices.given_ml > 1e-9))
+
+
+def _fallen(
+    grid: MapCells | SquareGrid,
+    strips: Sequence[Strip],
+    prescription: Prescription,
+    corners: tuple[Floats, Floats],
+    flown: BaseGeometry | None,
+) -> tuple[Floats, Floats]:
+    """Return each cell's ground that strips came over [m2], and all that fell on it [mL].
+
+    Of a cell with ground in the field that ground alone counts, and what fell on it.
+    """
+    cells = grid.rows * grid.columns
+    size_m = min(
+        float(np.hypot(*(np.diff(each[:2, :2], axis=axis)[0, 0] for each in corners)))
+        for axis in (0, 1)
     )
+    count = max(2, min(math.ceil(size_m / PIECE_MAX_M), math.isqrt(PARTS_MAX // cells)))
+    fine, piece_m = grid.finer(count), 0.5 * size_m / count
+    totals = np.zeros((2, cells * count * count + 1))
+    for strip in strips:
+        slices = slices_of(strip, piece_m)
+        values = [slices.area_m2, slices.given_ml]
+        totals += summed(fine, slices, piece_m, values, _taking_part(strip, slices))
+    over_m2, given_ml = totals[:, :-1]
+    part_m2 = np.repeat(np.repeat(_cell_areas(*corners), count, 0), count, 1).ravel() / count**2
+    over = over_m2 > TAKEN_FROM * part_m2
+    if flown is not None:
+        rest = np.flatnonzero(~over)
+        over[rest] = within(flown, *fine.middles(rest))
+    some = np.flatnonzero(over | (given_ml > 0.0))
+    inside = np.zeros(len(over), dtype=np.bool_)
+    inside[some] = in_field(prescription, *fine.middles(some))
+
+    def of_cells(values: Floats) -> Floats:
+        parts = values.reshape(grid.rows, count, grid.columns, count)
+        total: Floats = parts.sum(axis=(1, 3))
+        return total
+
+    own_m2 = of_cells(part_m2 * (over & inside))
+    ground_m2 = np.where(own_m2 > 0.0, own_m2, of_cells(part_m2 * over))
+    fell_ml = np.where(own_m2 > 0.0, of_cells(given_ml * inside), of_cells(given_ml))
+    return ground_m2, fell_ml
 
 
 def _values(slices: Slices, duty: Floats) -> list[Floats]:
     track, area = slices.track, slices.area_m2
     at_duty, at_speed = track.at(duty, slices.time_s), track.at(track.speed_m_s, slices.time_s)
     inside = np.where(slices.inside, area, 0.0)
-    return [area, inside, slices.asked_ml, slices.given_ml, area * at_duty, area * at_speed]
+    return [area, inside, slices.asked_ml, area * at_duty, area * at_speed]
 
 
 def _maps(
     commanded: Floats,
     sums: _Sums,
+    fallen: tuple[Floats, Floats],
     corners: tuple[Floats, Floats],
     source: Literal["map", "squares"],
     cell_m: float,
     width_m: float,
 ) -> CellMaps:
-    ground, passed = _ground(sums, corners)
-    measured = L_HA_PER_ML_M2 * _share(sums.given_ml, ground, passed)
+    ground_m2, fell_ml = fallen
+    passed = np.isfinite(commanded)
+    measured = L_HA_PER_ML_M2 * _share(fell_ml, ground_m2, passed)
     speeds = _share(sums.speed, sums.area, passed)
     flow_error = (measured - commanded) * flow_for_rate(1.0, 1.0, width_m) * speeds
     counts = commanded > 0.0
@@ -252,7 +330,8 @@ def _maps(
         corner_north_m=corners[1],
         commanded_l_ha=commanded,
         measured_l_ha=measured,
-        passes=ground / _cell_areas(*corners),
+        ground_m2=ground_m2,
+        passes=np.where(sums.inside > 0.0, sums.inside, sums.area) / _cell_areas(*corners),
         duty=_share(sums.duty, sums.area, passed),
         speed_m_s=speeds,
         deviation_l_min=flow_error,
@@ -262,15 +341,22 @@ def _maps(
 
 
 def _commanded(
-    prescription: Prescription, sums: _Sums, corners: tuple[Floats, Floats], size_m: float | None
+    prescription: Prescription,
+    sums: _Sums,
+    corners: tuple[Floats, Floats],
+    size_m: float | None,
+    passed: Bools,
 ) -> Floats:
     """Return the rate of each cell that was passed; of squares of that size, where it is given.
 
     A strip has the rate under its middle. A square in one zone that the end of a strip of another
-    zone comes over is still to get its own rate.
+    zone comes over is still to get its own rate, and so is one that no strip came over.
     """
-    ground, passed = _ground(sums, corners)
-    commanded = L_HA_PER_ML_M2 * _share(sums.asked_ml, ground, passed)
+    commanded: Floats = np.full(passed.shape, np.nan)
+    middle = [(each[1:, 1:] + each[:-1, :-1])[passed] / 2.0 for each in corners]
+    commanded[passed] = np.nan_to_num(ground_rates(prescription, *middle))
+    asked = passed & (sums.inside > 0.0)
+    commanded[asked] = L_HA_PER_ML_M2 * sums.asked_ml[asked] / sums.inside[asked]
     if size_m is not None:
         west_m, south_m = corners[0][:-1, :-1][passed], corners[1][:-1, :-1][passed]
         sure, rates = rates_of_squares(prescription, west_m, south_m, size_m)
@@ -278,14 +364,9 @@ def _commanded(
     return commanded
 
 
-def _ground(sums: _Sums, corners: tuple[Floats, Floats]) -> tuple[Floats, Bools]:
-    """Return the ground that counts in each cell, outside the field all; and if it is enough."""
-    ground = np.where(sums.inside > 0.0, sums.inside, sums.area)
-    return ground, ground > PASSED_MIN * _cell_areas(*corners)
-
-
 def _share(total: Floats, ground: Floats, passed: Bools) -> Floats:
-    share: Floats = np.divide(total, ground, out=np.full(ground.shape, np.nan), where=passed)
+    where = passed & (ground > 0.0)
+    share: Floats = np.divide(total, ground, out=np.full(ground.shape, np.nan), where=where)
     return share
 
 
@@ -309,7 +390,7 @@ class MapCells:
             np.array([west, west, east, east]), np.array([south, north, south, north])
         )
         (rows, columns) = cells.shape
-        self._cells = cells
+        self._cells, self.count = cells, 1
         self.column = int(np.clip(np.floor(column.min()), 0, columns - 1))
         self.row = int(np.clip(np.floor(row.min()), 0, rows - 1))
         self.columns = int(np.clip(np.ceil(column.max()), self.column + 1, columns)) - self.column
@@ -318,10 +399,24 @@ class MapCells:
     def cells_of(self, east_m: Floats, north_m: Floats) -> Ints:
         """Return the number of each point's cell; rows x columns beside the grid."""
         column, row = self._cells.to_cells(east_m, north_m)
-        column, row = column - self.column, row - self.row
+        column, row = self.count * (column - self.column), self.count * (row - self.row)
         inside = (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
         number = np.floor(row).astype(np.int64) * self.columns + np.floor(column).astype(np.int64)
         return np.where(inside, number, self.rows * self.columns)
+
+    def finer(self, count: int) -> MapCells:
+        """Return the same ground in `count` times as many rows and columns."""
+        found = copy(self)
+        found.count = self.count * count
+        found.rows, found.columns = self.rows * count, self.columns * count
+        return found
+
+    def middles(self, numbers: Ints) -> tuple[Floats, Floats]:
+        """Return where the middles of cells are."""
+        row, column = np.divmod(numbers, self.columns)
+        return self._cells.to_frame(
+            self.column + (column + 0.5) / self.count, self.row + (row + 0.5) / self.count
+        )
 
     def corners(self) -> tuple[Floats, Floats]:
         """Return east and north of the cells' corners: (rows + 1, columns + 1) each."""

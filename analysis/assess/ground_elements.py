@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -62,6 +62,17 @@ class SquareGrid:
         row += column
         row[beside] = self.rows * self.columns
         return row
+
+    def finer(self, count: int) -> SquareGrid:
+        """Return the same ground in `count` times as many rows and columns."""
+        rows, columns, cell_m = self.rows * count, self.columns * count, self.cell_m / count
+        return replace(self, rows=rows, columns=columns, cell_m=cell_m)
+
+    def middles(self, numbers: Ints) -> tuple[Floats, Floats]:
+        """Return where the middles of cells are."""
+        row, column = np.divmod(numbers, self.columns)
+        east_m: Floats = self.west_m + self.cell_m * (column + 0.5)
+        return east_m, self.south_m + self.cell_m * (row + 0.5)
 
     def corners(self) -> tuple[Floats, Floats]:
         """Return east and north of the cells' corners: (rows + 1, columns + 1) each."""

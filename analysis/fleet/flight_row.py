@@ -35,7 +35,6 @@ from analysis.flown.holes import GAP_S
 from analysis.flown.read_applied import OFFSET_S_MAX, flight_of
 from analysis.journals.content import damages
 from analysis.report.legal_fields import told_in
-from analysis.report.treated import treated_of
 from companion.core.setup import Setup
 from companion.errors import JournalError, UnreadableError
 from companion.journal.coverage import read_coverage, read_treated
@@ -212,7 +211,7 @@ def _evaluated(journal: OpenJournal, setup: Setup, row: Row) -> Row:
     if not is_whole and not assessment.evaluation.applied_ml > 0.0:
         found["why_not_evaluated"] = "too little of the journal can be read"
         return versioned(found)
-    figures = figures_of(assessment, area_ha=treated_of(flight).area_ha, is_whole=is_whole)
+    figures = figures_of(assessment, area_ha=assessment.ground.treated_m2 / 1e4, is_whole=is_whole)
     evaluation = assessment.evaluation
     found |= {
         "area_ha": figures.area_ha,

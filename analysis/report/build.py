@@ -26,12 +26,13 @@ from jinja2 import Environment, StrictUndefined, Template
 from markupsafe import Markup
 
 from analysis.assess.assessment import Assessment, Figures, assess, figures_of
+from analysis.assess.ground import Treated, treated_of
 from analysis.flown.applied_record import EvaluationError
 from analysis.flown.read_applied import read_applied
+from analysis.report.clock import Clock, clock_of, duration_text
 from analysis.report.contents import contents_of, reasons_in_words
 from analysis.report.legal import LegalRecord, legal_record
 from analysis.report.legal_fields import Told, facts_of, told_with
-from analysis.report.treated import Clock, Treated, clock_of, duration_text, treated_of
 from companion.config.application_table import PROFILES, Profile
 from companion.csv_table import csv_of
 from companion.errors import ConfigError
@@ -87,7 +88,7 @@ def build_report(journal: Path, options: ReportOptions, *, say: Say = lambda _: 
         until_s=math.inf if treated.last_s is None else treated.last_s,
     )
     say("evaluating")
-    assessment, why_not = _assessed(flight, is_whole=not (unread or flight.lost))
+    assessment, why_not = _assessed(flight, treated, is_whole=not (unread or flight.lost))
     clock = _clock(flight, told, treated, options.time_zone)
     figures = figures_of(assessment, area_ha=treated.area_ha, is_whole=not (unread or flight.lost))
     facts = facts_of(flight, treated, clock, unread=len(unread), **_volumes(figures))
@@ -107,10 +108,12 @@ def build_report(journal: Path, options: ReportOptions, *, say: Say = lambda _: 
     return _with_files(contents, records, assessment, clock, treated, options)
 
 
-def _assessed(flight: AppliedFlight, *, is_whole: bool) -> tuple[Assessment | None, str]:
+def _assessed(
+    flight: AppliedFlight, treated: Treated, *, is_whole: bool
+) -> tuple[Assessment | None, str]:
     """Return the evaluation, or None and why there is none: nothing flown, or too little read."""
     try:
-        found = assess(flight)
+        found = assess(flight, treated=treated)
     except EvaluationError as error:
         why = str(error).removeprefix(f"{flight.path}: ")
         return None, why if is_whole else TOO_LITTLE
@@ -133,6 +136,7 @@ def _volumes(figures: Figures) -> dict[str, Any]:
     return {
         "volume_l": figures.applied_l or 0.0,
         "volume_by": "model of the executed changes" if by == "model" else by,
+        "modelled_l": figures.modelled_l,
         "prescribed_l": figures.prescribed_l,
     }
 

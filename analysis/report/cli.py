@@ -61,8 +61,8 @@ def report_flight(
     what can be read is written; 2: no journal, an option is wrong, or DIR cannot be written.
     """
     from analysis.report.build import ReportOptions, browser, build_report
+    from analysis.report.clock import zone_of
     from analysis.report.folder import check_folder, earlier_files, write_files
-    from analysis.report.treated import zone_of
 
     began_s = time.perf_counter()
     check_folder(out)

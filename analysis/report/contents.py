@@ -13,19 +13,20 @@ from analysis.assess.causes import Cause, rate_wishes
 from analysis.flown.holes import GAP_S, UNREAD
 from analysis.journals.content import content_sha256
 from analysis.published import P1_RESULTS
+from analysis.report.clock import duration_text
 from analysis.report.label import label_of
 from analysis.report.legal_fields import wind_note
-from analysis.report.treated import duration_text
 from companion.core.types import Inhibit
 from companion.simulated import SIMULATED
 
 if TYPE_CHECKING:
     from analysis.assess.assessment import Assessment, Figures
     from analysis.assess.breakdowns import AccuracyGroup
+    from analysis.assess.ground import Treated
     from analysis.flown.applied_flight import AppliedFlight
+    from analysis.report.clock import Clock
     from analysis.report.legal import LegalRecord
     from analysis.report.legal_fields import Told
-    from analysis.report.treated import Clock, Treated
     from companion.core.boom import Valve
     from companion.core.schedule import LagModel
 
@@ -35,7 +36,8 @@ REPORT_VERSION = 2
 METRICS = (
     "lag_distance_m", "settled_lag_distance_m", "spraying_accuracy_percent", "misapplied_percent",
     "limit_ratio", "settled_accuracy_percent", "starting_accuracy_percent", "border_margin_m",
-    "off_target_ml", "missed", "apart", "gap_m2", "overlap_m2", "volume_error_percent",
+    "off_target_ml", "off_line_ml", "missed", "apart", "gap_m2", "overlap_m2",
+    "volume_error_percent",
 )  # fmt: skip
 # Of the journal's meta, what is not shown as such.
 _LONG = ("setup", "config_toml", "application_json", "declared_json", "flight_map_json")
@@ -296,23 +298,39 @@ def sentence_of(figures: Figures, training: str | None) -> str:
         SIMULATED: "L applied in a simulation",
     }
     done = what.get(training or "", "L applied")
-    how = "by the flow meter" if figures.applied_by == "flow meter" else "modelled, not metered"
+    how = "modelled, not metered"
+    if figures.applied_by == "flow meter":
+        how = f"by the flow meter; modelled {figures.modelled_l:.2f} L"
     parts = [f"{figures.applied_l:.2f} {done} ({how}) on {figures.area_ha:.2f} ha"]
     if figures.prescribed_l and figures.off_percent is not None:
         parts[0] += (
             f", where the map asked for {figures.prescribed_l:.2f} L ({figures.off_percent:+.1f} %)"
         )
+    if figures.untreated_percent is not None:
+        parts.append(
+            f"not treated: {figures.untreated_m2:.0f} m2 ({figures.untreated_percent:.0f} %) of "
+            f"the field, {figures.missed_m2:.0f} m2 of it under passes that were flown"
+        )
     if figures.within_10_percent is not None:
-        parts.append(f"{figures.within_10_percent:.1f} % of the ground got its rate within 10 %")
-    if figures.missed_m2 is not None:
-        parts.append(f"{figures.missed_m2:.0f} m2 were flown over and missed")
+        parts.append(
+            f"{figures.within_10_percent:.1f} % of the ground under its passes got its rate "
+            "within 10 %"
+        )
     if figures.worst_m is not None:
         parts.append(
-            f"no change of rate lay more than {figures.worst_m:.2f} m from its boundary (a bound, "
-            "95 %)"
+            f"{judged_text(figures)} lay within {figures.worst_m:.2f} m of their boundary "
+            "(a bound, 95 %)"
         )
-    parts.append(f"{figures.outside_ml:.1f} mL fell outside the border")
+    parts.append(f"{figures.outside_ml:.1f} mL fell outside the field")
     return "; ".join(parts) + "."
+
+
+def judged_text(figures: Figures) -> str:
+    """Return which changes a bound is for: of what was left out it says nothing."""
+    count, every = figures.lag_count, figures.change_count
+    if count == every:
+        return f"all {count} changes of rate"
+    return f"the {count} of {every} changes of rate that can be judged"
 
 
 def warnings_of(
@@ -425,7 +443,7 @@ def held_ground(assessment: Assessment | None) -> Iterator[Caution]:
         for name, area_m2 in by_reason
         if name != UNREAD
     )
-    if not reasons or not held_m2 > HELD_SHARE * causes.judged_m2:
+    if not reasons or not held_m2 > HELD_SHARE * causes.passed_m2:
         return
     yield _warning(
         "held-ground",
@@ -504,7 +522,12 @@ def _flow(assessment: Assessment | None, why_not: str) -> Iterator[Caution]:
         text = f"{evaluation.missed} {changes} of rate (on and off at borders included)"
         yield _warning("missed", f"{text} never happened, according to the journal.")
     if evaluation.off_target_ml > 1.0:
-        yield _warning("outside", f"{evaluation.off_target_ml:.1f} mL fell outside the border.")
+        yield _warning("outside", f"{evaluation.off_target_ml:.1f} mL fell outside the field.")
+    if evaluation.off_line_ml > 1.0:
+        yield _note(
+            "off-line",
+            f"{evaluation.off_line_ml:.1f} mL fell in the field, beside the planned lines.",
+        )
 
 
 def _labels(record: LegalRecord) -> Iterator[str]:
@@ -571,7 +594,8 @@ DEFINITIONS: dict[str, tuple[str, str, str]] = {
         "m",
         "from where the spray ended, or began, to the border; 0 or more: nothing fell outside",
     ),
-    "off_target_ml": ("Outside", "mL", "volume outside the border or in exclusions"),
+    "off_target_ml": ("Outside", "mL", "volume beyond the border or in exclusions"),
+    "off_line_ml": ("Off the lines", "mL", "volume in the field, beside the planned lines"),
     "gap_m2": ("Gaps", "m\u00b2", "ground left out at switches on and off"),
     "overlap_m2": ("Overlap", "m\u00b2", "ground treated beyond the boundary at switches"),
     "volume_error_percent": (

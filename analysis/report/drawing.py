@@ -42,10 +42,11 @@ if TYPE_CHECKING:
     from analysis.assess.assessment import Assessment
     from analysis.assess.breakdowns import Group
     from analysis.assess.cell_maps import CellMaps, Histogram
+    from analysis.assess.ground import Treated
     from analysis.evaluation import Evaluation
     from analysis.flown.applied_flight import AppliedFlight, Floats, Series
     from analysis.lag import Step
-    from analysis.report.treated import Clock, Treated
+    from analysis.report.clock import Clock
     from analysis.student import Interval
     from analysis.track import Ints
 
@@ -109,7 +110,7 @@ def prescribed_and_applied(sheet: Sheet) -> Drawn:
         name="map",
         title="Prescribed and applied",
         caption=f"{_cells_text(sheet.cells)} The darker, the more; grey is rate 0, "
-        "white was not flown over. The thin line is the path of the vehicle, the black one "
+        "white was under no pass. The thin line is the path of the vehicle, the black one "
         "the border.",
         alt="Two maps of the field with one scale of colours: the prescribed rate of each cell, "
         "and the rate that was applied.",

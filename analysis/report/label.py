@@ -19,9 +19,10 @@ from companion.config.limits import WATCH_S, LimitsFile, limits_of
 from companion.core.label import DAY_S, LabelLimits, is_from
 
 if TYPE_CHECKING:
+    from analysis.assess.ground import Treated
     from analysis.flown.applied_flight import AppliedFlight, Floats, Series
+    from analysis.report.clock import Clock
     from analysis.report.legal_fields import Told
-    from analysis.report.treated import Clock, Treated
 
 # Less of the spraying than this outside is noise of a filter, not a limit that was broken.
 OUTSIDE_MAX_S = 0.2

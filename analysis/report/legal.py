@@ -248,7 +248,10 @@ def _why_not_real(told: Told, facts: Facts) -> Iterator[str]:
 
 def _remarks(told: Told, facts: Facts) -> Iterator[str]:
     if facts.has_area:
-        yield f"quantities are by the {facts.volume_by}"
+        beside = ""
+        if facts.volume_by == "flow meter" and facts.modelled_l is not None:
+            beside = f"; by the model of the executed changes {facts.modelled_l:.3f} L"
+        yield f"quantities are by the {facts.volume_by}{beside}"
     if facts.clock_source == "computer":
         yield "times are by the clock of the companion, not verified"
     if facts.clock_source == "operator":

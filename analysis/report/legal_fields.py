@@ -24,8 +24,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
+    from analysis.assess.ground import Treated
     from analysis.flown.applied_flight import AppliedFlight, Floats
-    from analysis.report.treated import Clock, Treated
+    from analysis.report.clock import Clock
 
 # What people said for the record: before the flight by the configuration, after it by options.
 #
@@ -197,6 +198,7 @@ class Facts:
     area_ha: float
     volume_l: float
     volume_by: str
+    modelled_l: float | None
     mean_rate_l_ha: float | None
     asked_rate_l_ha: float | None
     boom_width_m: float
@@ -446,6 +448,7 @@ def facts_of(
     volume_l: float,
     volume_by: str,
     prescribed_l: float | None,
+    modelled_l: float | None = None,
     unread: int = 0,
 ) -> Facts:
     """Return the facts; `volume_by` says in words what measured `volume_l`.
@@ -468,6 +471,7 @@ def facts_of(
         area_ha=area_ha,
         volume_l=volume_l,
         volume_by=volume_by,
+        modelled_l=modelled_l,
         mean_rate_l_ha=volume_l / area_ha if area_ha > 0.0 else None,
         asked_rate_l_ha=None
         if prescribed_l is None or not area_ha > 0.0

@@ -17,6 +17,7 @@ from analysis.assess.assessment import Assessment, _no_less_than_0, assess, bala
 from analysis.assess.breakdowns import speed_bin
 from analysis.assess.causes import Cause
 from analysis.assess.cell_maps import cell_maps
+from analysis.assess.ground import ground_of, treated_of
 from analysis.flown.applied_flight import Series
 from analysis.flown.applied_record import record_of
 from analysis.strips import strips_of
@@ -152,8 +153,7 @@ def test_a_speed_lies_in_the_bin_around_it() -> None:
 def test_cells_hold_all_that_was_sprayed(good: Assessment) -> None:
     cells = good.cells
     assert cells is not None
-    area_m2 = cells.passes * cells.cell_m**2
-    applied_ml = float(np.nansum(cells.measured_l_ha * area_m2)) / 10.0
+    applied_ml = float(np.nansum(cells.measured_l_ha * cells.ground_m2)) / 10.0
     assert applied_ml == pytest.approx(good.evaluation.applied_ml, rel=0.01)
     assert cells.corner_east_m.shape == tuple(n + 1 for n in cells.commanded_l_ha.shape)
 
@@ -257,6 +257,27 @@ def test_a_valve_that_spares_treated_ground_leaves_every_cell_its_dose() -> None
     np.testing.assert_allclose(both.commanded_l_ha, once.commanded_l_ha)
 
 
+def test_a_dose_is_the_sum_of_two_passes() -> None:
+    once, twice = (
+        assess(eastwards(passes_north_m=passes)).cells for passes in ((3.0,), (3.0, 3.0))
+    )
+    assert once is not None
+    assert twice is not None
+    # The second pass begins at another part of a step.
+    np.testing.assert_allclose(twice.measured_l_ha, 2.0 * once.measured_l_ha, rtol=0.1, atol=1.0)
+    np.testing.assert_allclose(twice.commanded_l_ha, once.commanded_l_ha, rtol=1e-5)
+    assert twice.judged_m2 == pytest.approx(once.judged_m2)
+
+
+def test_litres_are_asked_of_the_ground_that_was_treated() -> None:
+    found = assess(eastwards(given=rows_of_plots(3), shut_m=(24.0, 36.0)))
+    # Of four plots by one row, the third stayed bare: 20, 25 and 20 L/ha on 72 m2 each.
+    assert found.ground.treated_m2 == pytest.approx(3 * 72.0, rel=0.02)
+    assert found.balance.prescribed_l == pytest.approx(65.0 * 72.0 / 1e4, rel=0.02)
+    assert found.ground.missed_m2 == pytest.approx(72.0, rel=0.06)
+    assert found.ground.untreated_m2 == pytest.approx(9 * 72.0, rel=0.02)
+
+
 # -------------------------------------------------------------------------------------- causes
 
 
@@ -268,7 +289,7 @@ def test_what_the_operator_wished_is_the_operators(text: str, is_wish: bool) -> 
     assert causes.by_cause[Cause.OPERATOR] == pytest.approx(
         causes.off_m2 if is_wish else 0.0, rel=0.05
     )
-    assert causes.off_m2 > 0.9 * causes.judged_m2
+    assert causes.off_m2 > 0.9 * causes.passed_m2
     assert math.fsum(causes.by_cause.values()) == pytest.approx(causes.off_m2)
 
 
@@ -289,8 +310,9 @@ def shares(found: Assessment) -> dict[Cause, float]:
 
 
 def test_a_perfect_pass_is_off_at_the_border_only(good: Assessment) -> None:
-    assert good.causes.within_percent is not None
-    assert good.causes.within_percent > 95.0
+    assert good.cells is not None
+    assert good.cells.within_percent is not None
+    assert good.cells.within_percent > 95.0
     assert set(shares(good)) <= {Cause.EDGE, Cause.CHANGE}
 
 
@@ -351,6 +373,7 @@ def test_the_balance_knows_refills_and_meter() -> None:
     flight = eastwards()
     record = record_of(flight)
     applied_l = float(record.volume_ml[-1].sum()) / 1000.0
+    asked_l = ground_of(flight, record, strips_of(record), treated_of(flight)).asked_l
     level = np.array([10.0, 9.5, 14.5, 14.0, 14.0 - applied_l])
     count_ml = np.linspace(0.0, 1000.0 * applied_l * 1.02, 5)
     times = np.linspace(record.time_s[0], record.time_s[-1], 5)
@@ -359,12 +382,12 @@ def test_the_balance_knows_refills_and_meter() -> None:
         tank_l=Series(time_s=times, value=level),
         meter_ml=Series(time_s=times, value=count_ml),
     )
-    found = balance_of(filled, strips_of(record), 1000.0 * applied_l)
+    found = balance_of(filled, 1000.0 * applied_l, asked_l)
     assert found.refilled_l == pytest.approx(5.0)
     assert found.tank_l == pytest.approx(1.0 + applied_l)
     assert found.meter_to_model_percent == pytest.approx(2.0)
     assert found.model_to_prescribed_percent == pytest.approx(0.0, abs=1.5)
-    assert balance_of(flight, strips_of(record), 0.0).meter_l is None
+    assert balance_of(flight, 0.0, asked_l).meter_l is None
 
 
 def test_a_gap_in_the_journal_is_no_spraying() -> None:
@@ -399,7 +422,6 @@ def test_a_flight_that_never_sprayed_has_figures_of_nothing() -> None:
     found = assess(dry)
     assert found.evaluation.applied_ml == 0.0
     assert found.cells is None
-    assert found.causes.within_percent is None
     assert found.intervals["lag_distance_m"].count == 0
     assert found.balance.model_to_prescribed_percent is None
     assert found.durations.spraying_s == 0.0

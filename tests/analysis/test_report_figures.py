@@ -11,16 +11,15 @@ import shapely
 import shapely.affinity
 from hypothesis import given
 from hypothesis import strategies as st
+from shapely.geometry.base import BaseGeometry
 
 from analysis.assess.assessment import assess, bound_m, figures_of, uncertainty_m, worst_of
-from analysis.assess.causes import _shares
-from analysis.assess.ground_elements import SquareGrid
+from analysis.assess.ground import _lattice, within
 from analysis.flown.applied_flight import AppliedFlight, Series
 from analysis.flown.read_applied import read_applied
 from analysis.report.build import ReportOptions, build_report
 from analysis.report.drawing import _rates_shown
 from companion.config.application_table import PROFILES
-from companion.core.prescription import Prescription, Zone
 from tests.analysis.report_flight import fly
 from tests.bench.worst import disagreements
 from tests.golden.checking import names, unpacked
@@ -121,15 +120,18 @@ def test_what_scatters_as_stated_keeps_the_bound(lags: list[float], sd: float, s
 
 
 @pytest.mark.parametrize("turned_deg", [0.0, 12.0, 45.0])
-def test_squares_that_a_slanted_edge_cuts_count_with_their_geometry(turned_deg: float) -> None:
-    field = shapely.affinity.rotate(shapely.box(0.0, 0.0, 61.3, 22.7), turned_deg, origin=(0, 0))
-    prescription = Prescription([Zone(name="all", polygon=field, rate_l_ha=20.0)])
-    grid = SquareGrid.over(prescription.bounds_m, 0.5)
-    share, east_m, north_m = _shares(prescription, grid)
-    assert float(share.sum()) * 0.25 == pytest.approx(field.area, rel=1e-3)
-    # The place of each is in the field, so that its rate is that of the ground and not of none.
-    inside = shapely.contains_xy(field.buffer(1e-6), east_m[share > 0.0], north_m[share > 0.0])
-    assert inside.all()
+def test_points_of_a_field_count_its_strips_however_they_lie(turned_deg: float) -> None:
+    def turned(*box: float) -> BaseGeometry:
+        return shapely.affinity.rotate(shapely.box(*box), turned_deg, origin=(0, 0))
+
+    field = turned(0.0, 0.0, 61.3, 22.7)
+    places = _lattice(field)
+    assert within(field, *places).all()
+    # Ten passes of a metre, as edges that lie along rows of points would be in or out as one.
+    strips = shapely.union_all(
+        [turned(0.0, 2.0 * each, 61.3, 2.0 * each + 1.0) for each in range(10)]
+    )
+    assert within(strips, *places).mean() == pytest.approx(strips.area / field.area, rel=2e-3)
 
 
 def test_the_scale_of_rates_reaches_down_to_what_was_applied() -> None:

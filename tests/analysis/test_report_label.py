@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from analysis.assess.ground import treated_of
 from analysis.flown.applied_flight import AppliedFlight, Series
 from analysis.flown.read_applied import read_applied
+from analysis.report.clock import Clock
 from analysis.report.label import label_of
 from analysis.report.legal_fields import told_with
-from analysis.report.treated import Clock, treated_of
 from companion.core.inputs import WindReport
 from companion.journal.journal import Journal
 from tests.analysis.applied_flights import eastwards

@@ -10,11 +10,12 @@ from datetime import UTC
 
 import pytest
 
+from analysis.assess.ground import treated_of
 from analysis.flown.read_applied import read_applied
 from analysis.report.build import record_csv, record_json
+from analysis.report.clock import Clock
 from analysis.report.legal import legal_record
 from analysis.report.legal_fields import Facts, Told, facts_of, told_with
-from analysis.report.treated import Clock, treated_of
 from companion.config.application_table import PROFILES, Profile
 from companion.simulated import Simulated
 from tests.analysis.report_flight import EU_TOLD, fly

@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 import shapely
 
+from analysis.assess.ground import treated_of
 from analysis.flown.applied_flight import AppliedFlight, Series
 from analysis.flown.read_applied import read_applied
 from analysis.report.build import record_csv, record_json
+from analysis.report.clock import Clock
 from analysis.report.contents import warnings_of
 from analysis.report.legal import AFTER, BEFORE, FLIGHT, legal_record
 from analysis.report.legal_fields import Facts, ends_spraying, facts_of, told_in, told_with
-from analysis.report.treated import Clock, treated_of
 from companion.config.application_table import PROFILES
 from companion.errors import ConfigError
 from tests.analysis.report_flight import EU_TOLD, fly

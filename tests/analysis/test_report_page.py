@@ -16,8 +16,10 @@ import pytest
 from analysis.assess.assessment import assess, figures_of
 from analysis.assess.causes import Cause
 from analysis.assess.cell_maps import Histogram
+from analysis.assess.ground import treated_of
 from analysis.flown.read_applied import read_applied
 from analysis.report.build import Report, ReportOptions, build_report, embedded, page_of
+from analysis.report.clock import clock_of
 from analysis.report.contents import (
     METRICS,
     contents_of,
@@ -27,7 +29,6 @@ from analysis.report.contents import (
 )
 from analysis.report.drawing import histogram
 from analysis.report.legal_fields import told_with
-from analysis.report.treated import clock_of, treated_of
 from companion.journal.writer import Event
 from tests import builders
 from tests.analysis.report_flight import EU_TOLD, fly
@@ -118,7 +119,8 @@ def test_the_first_screen_speaks_to_a_farmer(report: Report, page: Parsed) -> No
     text = re.sub(r"\s+", " ", page.text).partition("On the ground")[0]
     assert f"{contents['verdict']['applied_l']:.2f} L" in text
     assert "modelled, not metered" in text
-    assert "flown over and missed" in text
+    percent = f"({contents['verdict']['untreated_percent']:.0f} %)"
+    assert re.search(rf"m² {re.escape(percent)}\s?of the field not treated", text)
     # The model's largest lag distance is no bound, and no headline.
     assert "worst" not in text
     # Times as they are read; the zone is named beside them.
@@ -305,7 +307,7 @@ def test_ground_that_was_flown_over_closed_is_a_warning_with_its_reasons(journal
     causes = assessment.causes
 
     def said(share: float, **by_inhibit: float) -> list[str]:
-        area_m2 = {**causes.by_cause, Cause.INHIBIT: share * causes.judged_m2}
+        area_m2 = {**causes.by_cause, Cause.INHIBIT: share * causes.passed_m2}
         reasons = {name.replace("_", "-"): each for name, each in by_inhibit.items()}
         held = replace(assessment, causes=replace(causes, by_cause=area_m2, by_inhibit=reasons))
         return [each.text for each in held_ground(held)]

@@ -12,9 +12,9 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
+from analysis.assess.ground import open_spans, treated_of
 from analysis.flown.applied_flight import AppliedFlight, ValveChanges
 from analysis.flown.read_applied import read_applied
-from analysis.report.treated import open_spans, treated_of
 from tests.analysis.report_flight import fly
 
 NAN = math.nan

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.border import off_target_ml
+from analysis.border import off_target
 from analysis.strips import strips_of
 from companion.config import Config, load
 from companion.core.setup import Setup
@@ -106,7 +106,7 @@ def flown(
         "planned_l": sortie.volume_l,
         "twin_l": float(used_l.sum()),
         "between_l": float(used_l[~on_line[1:]].sum()),
-        "off_lines_ml": off_target_ml(strips_of(record), record.prescription),
+        "off_lines_ml": off_target(strips_of(record), record.prescription).off_line_ml,
         "ferry_m": sortie.length_m("ferry") + sortie.length_m("transit"),
         "simulated_s": result.simulated_s,
     }

@@ -72,7 +72,9 @@ def disagreements(report: Report) -> Iterator[str]:
     is_metered = balance["meter_l"] is not None
     applied_l = balance["meter_l"] if is_metered else balance["model_l"]
     off = balance["meter_to_prescribed_percent" if is_metered else "model_to_prescribed_percent"]
-    how = "by the flow meter" if is_metered else "modelled, not metered"
+    how = "modelled, not metered"
+    if is_metered:
+        how = f"by the flow meter; modelled {balance['model_l']:.2f} L"
     sentence = verdict["sentence"]
     for part in (
         f"{applied_l:.2f} L",

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import shapely
 
-from analysis.border import off_target_ml
+from analysis.border import off_target
 from analysis.flight_record import FlightMeta, FlightRecord
 from analysis.strips import strips_of
 from analysis.track import PlannedLines
@@ -141,7 +141,7 @@ def test_the_papers_field_is_planned_and_flown_with_nothing_off_its_lines(
     fly = ["sitl", "fly", "--config", str(copied), "--mission", str(out), "--json"]
     execute([*fly, "--corners", corners])
     (flight,) = json.loads(capsys.readouterr().out)["flights"]
-    assert flight["off_target_ml"] < 0.05
+    assert flight["off_target_ml"] + flight["off_line_ml"] < 0.05
     assert flight["missed"] == 0
     assert flight["applied_ml"] / 1000.0 == pytest.approx(planned["volume_l"], rel=litres)
 
@@ -179,12 +179,13 @@ def record(places: list[Place], *, lines: Lines | None) -> FlightRecord:
 LINES = Lines(polylines=(((10.0, 3.0), (40.0, 3.0)),))
 
 
-def test_what_falls_off_the_lines_is_off_target_and_nothing_is_asked_there() -> None:
+def test_what_falls_off_the_lines_is_named_so_and_nothing_is_asked_there() -> None:
     whole, some = (record([(2.0, 3.0), (46.0, 3.0)], lines=lines) for lines in (None, LINES))
-    assert off_target_ml(strips_of(whole), whole.prescription) == pytest.approx(0.0, abs=1e-6)
+    assert off_target(strips_of(whole), whole.prescription) == pytest.approx((0.0, 0.0), abs=1e-6)
     # 14 m of the 44 m at 5 m/s, six valves of 10 mL/s
-    beyond = off_target_ml(strips_of(some), some.prescription)
-    assert beyond == pytest.approx(14.0 / 5.0 * 60.0, rel=0.01)
+    beyond = off_target(strips_of(some), some.prescription)
+    assert beyond.outside_ml == pytest.approx(0.0, abs=1e-6)
+    assert beyond.off_line_ml == pytest.approx(14.0 / 5.0 * 60.0, rel=0.01)
     asked = [strips_of(each)[0].asked_ml[-1] for each in (whole, some)]
     metres = [10 * 20 + 12 * 25 + 12 * 15 + 10 * 20, 2 * 20 + 12 * 25 + 12 * 15 + 4 * 20]
     assert asked[1] / asked[0] == pytest.approx(metres[1] / metres[0], rel=0.01)

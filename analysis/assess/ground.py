@@ -1,31 +1,35 @@
-"""From where to where was sprayed: the ground that open valves went over, as polygons.
+"""From where to where was sprayed, as polygons, and what became of the field's ground.
 
 Of each valve the stretches of path during which it was open, from the executed changes moved by
 the lags of on and off: where a sharp beginning and end of the spray lie. What the wind makes of it
 is not known here.
+
+Ground that this flight was to treat is that of the planned lines that it flew; without any, all
+that the boom came over, and gaps between two passes. Bare ground is missed there, and left to other
+flights elsewhere.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta, tzinfo
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from companion.config.application_table import zone_named
+from analysis.changes import ground_rates
+from companion.core.boom import Valve
 from companion.core.frame import LocalFrame
-from companion.errors import ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
+    from analysis.flight_record import FlightRecord
     from analysis.flown.applied_flight import AppliedFlight, Floats
-    from companion.core.boom import Valve
-
+    from analysis.strips import Strip
+    from analysis.track import Bools, PlannedLines
 
 # Points of an edge that lie this near to a straight line say nothing of the ground.
 SIMPLIFY_M = 0.03
@@ -37,9 +41,13 @@ LENGTH_MIN_M = 0.05
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Treated:
-    """The ground sprayed, in the flight's frame; times are those of the valves' first and last."""
+    """The ground sprayed, in the flight's frame; times are those of the valves' first and last.
+
+    `twice` is what two openings went over, of one valve or of two.
+    """
 
     area: BaseGeometry
+    twice: BaseGeometry
     first_s: float | None
     last_s: float | None
 
@@ -76,9 +84,19 @@ def treated_of(flight: AppliedFlight) -> Treated:
     area = area.buffer(CLOSE_M, join_style="mitre").buffer(-CLOSE_M, join_style="mitre")
     return Treated(
         area=shapely.simplify(area, SIMPLIFY_M),
+        twice=_twice(strips),
         first_s=min((span[0] for span in spans), default=None),
         last_s=max((span[1] for span in spans), default=None),
     )
+
+
+def _twice(strips: Sequence[BaseGeometry]) -> BaseGeometry:
+    """Return where strips overlap; neighbours whose edges were rounded apart do not."""
+    shapes = np.array(strips, dtype=object)
+    one, other = shapely.STRtree(shapes).query(shapes, predicate="intersects")
+    first = one < other
+    both = shapely.union_all(shapely.intersection(shapes[one[first]], shapes[other[first]]))
+    return both.buffer(-CLOSE_M, join_style="mitre").buffer(CLOSE_M, join_style="mitre")
 
 
 def open_spans(flight: AppliedFlight, valve: int) -> Iterator[tuple[float, float]]:
@@ -154,95 +172,96 @@ def _positions(frame: LocalFrame, ring: shapely.LinearRing) -> list[list[float]]
     ]
 
 
-# Times of the report: whose clock they are by, and in which time zone they are written.
+# What became of the field's ground, counted on points of a lattice.
 
-# Before there was this program: a clock that shows it was never set.
-PLAUSIBLE_FROM = datetime(2024, 1, 1, tzinfo=UTC)
-SOURCES = {
-    "autopilot": "clock of the autopilot (UTC from its satellite receiver)",
-    "computer": "clock of the companion, not verified",
-    "operator": "given by the operator",
-}
+POINTS = 200_000
+# No finer: the strips themselves are good to some centimetres.
+POINT_M = 0.1
+# Not along any row of passes: a lattice that lies along an edge counts it all in or all out.
+LATTICE_RAD = 0.5536
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Clock:
-    """Makes a time of day of a flight's seconds; `source` is a key of `SOURCES`."""
+class Ground:
+    """Areas of the field in square metres, and litres prescribed where it was treated.
 
-    offset_s: float
-    source: str
-    zone: tzinfo
-    zone_name: str
+    `untreated_m2` has a rate and was not treated in this flight: `missed_m2` of it lay under what
+    this flight flew, `between_m2` of that between two passes; all else is left to other flights.
+    `own` is the ground of the planned lines that were flown; None without any lines.
+    """
 
-    @property
-    def is_verified(self) -> bool:
-        """Return whether somebody vouches for the time: the autopilot, or the operator."""
-        return self.source != "computer"
-
-    @property
-    def source_text(self) -> str:
-        """Return in words whose clock it is."""
-        return SOURCES[self.source]
-
-    def at(self, time_s: float | None) -> datetime | None:
-        """Return a moment of the flight; None for no time, or one that a clock never set shows."""
-        if time_s is None or not math.isfinite(time_s + self.offset_s):
-            return None
-        try:
-            moment = datetime.fromtimestamp(time_s + self.offset_s, self.zone)
-        except (ValueError, OverflowError, OSError):
-            return None
-        return moment if moment >= PLAUSIBLE_FROM else None
-
-    def text(self, time_s: float | None) -> str | None:
-        """Return the moment as ISO 8601 with its offset from UTC, to the second."""
-        moment = self.at(time_s)
-        return None if moment is None else moment.isoformat(timespec="seconds")
-
-    def moved_to(self, start_time: str, first_s: float | None) -> Clock:
-        """Return a clock by which the first spraying was at `start_time`, as the operator says."""
-        if first_s is None:
-            return self
-        moment = datetime.fromisoformat(start_time)
-        return Clock(
-            offset_s=moment.timestamp() - first_s,
-            source="operator",
-            zone=self.zone,
-            zone_name=self.zone_name,
-        )
+    treated_m2: float
+    doubled_m2: float
+    untreated_m2: float
+    missed_m2: float
+    between_m2: float
+    asked_l: float
+    rated_m2: float
+    own: BaseGeometry | None = None
 
 
-def clock_of(flight: AppliedFlight, time_zone: str | None) -> Clock:
-    """Return the flight's clock, in `time_zone` or in UTC; ConfigError where it is none."""
-    return Clock(
-        offset_s=flight.utc_offset_s,
-        source=flight.utc_source,
-        zone=zone_of(time_zone),
-        zone_name=time_zone or "UTC",
+def ground_of(
+    flight: AppliedFlight, record: FlightRecord, strips: Sequence[Strip], treated: Treated
+) -> Ground:
+    """Return what became of the field."""
+    field = record.prescription.field
+    if field.is_empty:
+        return Ground(
+            treated_m2=0.0, doubled_m2=0.0, untreated_m2=0.0, missed_m2=0.0, between_m2=0.0,
+            asked_l=0.0, rated_m2=0.0,
+        )  # fmt: skip
+    east_m, north_m = _lattice(field)
+    each_m2 = field.area / max(len(east_m), 1)
+    rates = np.nan_to_num(ground_rates(record.prescription, east_m, north_m))
+    is_wet = within(treated.area, east_m, north_m)
+    bare = np.flatnonzero((rates > 0.0) & ~is_wet)
+    swept, own = _flown(flight, record, strips[0].track.planned)
+    at = (east_m[bare], north_m[bare])
+    missed = within(own, *at)
+    if record.treated is not None:
+        missed &= ~record.treated.covered_at(*at)
+    between = missed & ~within(swept, *at)
+    return Ground(
+        treated_m2=treated.area.area,
+        doubled_m2=treated.twice.area,
+        untreated_m2=len(bare) * each_m2,
+        missed_m2=int(missed.sum()) * each_m2,
+        between_m2=int(between.sum()) * each_m2,
+        asked_l=float(rates[is_wet].sum()) * each_m2 / 1e4,
+        rated_m2=int((rates > 0.0).sum()) * each_m2,
+        own=None if strips[0].track.planned is None else own,
     )
 
 
-def zone_of(name: str | None) -> tzinfo:
-    """Return the time zone of that name; UTC without one."""
-    if name is None or name == "UTC":
-        return UTC
-    zone = zone_named(name)
-    if zone is None:
-        raise ConfigError(
-            f"time zone {name}: not known here; write one such as Europe/Madrid or America/Chicago"
-        )
-    return zone
+def _lattice(field: BaseGeometry) -> tuple[Floats, Floats]:
+    """Return points of the field, evenly over it."""
+    west, south, east, north = field.bounds
+    step_m = max(math.sqrt(field.area / POINTS), POINT_M)
+    reach_m = 0.5 * math.hypot(east - west, north - south)
+    along = np.arange(-reach_m, reach_m, step_m)
+    u, v = (each.ravel() for each in np.meshgrid(along, along))
+    cos, sin = math.cos(LATTICE_RAD), math.sin(LATTICE_RAD)
+    east_m = 0.5 * (west + east) + cos * u - sin * v
+    north_m = 0.5 * (south + north) + sin * u + cos * v
+    inside = within(field, east_m, north_m)
+    return east_m[inside], north_m[inside]
 
 
-def duration_text(duration_s: float) -> str:
-    """Return a duration for a person.
+def within(area: BaseGeometry, east_m: Floats, north_m: Floats) -> Bools:
+    """Return which of many points lie in an area."""
+    shapely.prepare(area)
+    return np.asarray(shapely.contains_xy(area, east_m, north_m), dtype=np.bool_)
 
-    >>> duration_text(142.4), duration_text(59.6), duration_text(3725.0)
-    ('2 min 22 s', '1 min 0 s', '1 h 2 min')
-    """
-    whole = timedelta(seconds=round(duration_s))
-    minutes, seconds = divmod(int(whole.total_seconds()), 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours:
-        return f"{hours} h {minutes} min"
-    return f"{minutes} min {seconds} s" if minutes else f"{seconds} s"
+
+def _flown(
+    flight: AppliedFlight, record: FlightRecord, planned: PlannedLines | None
+) -> tuple[BaseGeometry, BaseGeometry]:
+    """Return the ground that the boom came over, and that which it was to treat."""
+    half_m = max(abs(v.right_m) + 0.5 * v.width_m for v in record.boom.valves)
+    path = shapely.LineString(np.column_stack([flight.east_m, flight.north_m])).simplify(SIMPLIFY_M)
+    swept = path.buffer(half_m, cap_style="flat")
+    if planned is None:
+        return swept, swept.buffer(half_m).buffer(-half_m)
+    return swept, shapely.union_all(
+        [way.buffer(half_m, cap_style="flat") for way in planned.ways(record)]
+    )

@@ -1,0 +1,175 @@
+"""What report, record and `sitl fly` print, held against the judge that counts from the truth."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from analysis.assess.assessment import Assessment, assess
+from analysis.flown.read_applied import read_applied
+from analysis.report.build import ReportOptions, build_report
+from companion.cli.app import execute
+from tests.ground_judge import Field, Truth, Verdict, doses_of, judge
+
+EXAMPLE = Path("examples/anyang/config.toml")
+# Areas to 1 % of the field, litres to 0.5 %.
+AREA, LITRES = 0.01, 0.005
+# The field of the tutorial: two zones, whose passes overlap by half a metre.
+TUTORIAL = (
+    (15, [(114.54400, 35.9960), (114.54419, 35.9960), (114.54419, 35.9963), (114.54400, 35.9963)]),
+    (25, [(114.54400, 35.9963), (114.54419, 35.9963), (114.54419, 35.9966), (114.54400, 35.9966)]),
+)
+# Half a hectare, askew to the map, in three sorties.
+ASKEW = (
+    (20, [(114.54400, 35.9960), (114.54480, 35.9961), (114.54470, 35.9966), (114.54405, 35.9968)]),
+)
+
+
+@dataclass(frozen=True)
+class Flown:
+    """A simulated flight: what was printed of it, and what the truth says."""
+
+    truth: Truth
+    field: Field
+    verdict: Verdict
+    result: dict[str, Any]
+    contents: dict[str, Any]
+    record: dict[str, Any]
+    assessed: Assessment
+
+
+def fly(folder: Path, zones: Any, lines: bool, *more: str) -> Flown:
+    """Plan and fly a field without scatter of valves or meter, and make its report."""
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"rate": rate},
+            "geometry": {"type": "Polygon", "coordinates": [[*ring, ring[0]]]},
+        }
+        for rate, ring in zones
+    ]
+    map_file = folder / "field.geojson"
+    map_file.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    plant = folder / "even.toml"
+    text = Path("sitl/profiles/wang-2024.toml").read_text()
+    for key in ("lag_scatter", "flow_scatter", "gain_spread", "noise"):
+        text = "\n".join(
+            f"{key} = 0.0" if line.startswith(key) else line for line in text.splitlines()
+        )
+    plant.write_text(text.replace('"smooth"', '"straight"'))
+    config = folder / "config.toml"
+    text = EXAMPLE.read_text()
+    head, _, tail = text.partition("[prescription]")
+    _, _, tail = tail.partition("\n[")
+    text = f'{head}[prescription]\nfile = "field.geojson"\nunit = "L/ha"\n\n[{tail}'
+    text = "\n".join(line for line in text.splitlines() if not line.startswith("angle_deg"))
+    config.write_text(text)
+    plan = folder / "field.plan"
+    depot = ["--depot", "35.9959,114.5440"]
+    execute(
+        ["plan", str(map_file), "--prescription", str(map_file), "--config", str(config),
+         "--out", str(plan), "--json", *depot, *more]
+    )  # fmt: skip
+    if lines:
+        config.write_text(text.replace("[mission]", '[mission]\nlines = "field.lines.geojson"'))
+    out = folder / "flown"
+    execute(
+        ["sitl", "fly", "--config", str(config), "--mission", str(plan), "--plant", str(plant),
+         "--out", str(out), "--json"]
+    )  # fmt: skip
+    truth = Truth.read(out / "truth.npz")
+    ground = Field.read(
+        map_file, truth.origin_deg, lines_file=folder / "field.lines.geojson" if lines else None
+    )
+    journal = out / "flight-0001.gpkg"
+    report = build_report(journal, ReportOptions(with_figures=False))
+    return Flown(
+        truth=truth,
+        field=ground,
+        verdict=judge([truth], ground),
+        result=json.loads((out / "result.json").read_text())["flights"][0],
+        contents=dict(report.contents),
+        record=json.loads(report.files["application-generic.json"])["fields"],
+        assessed=assess(read_applied(journal)),
+    )
+
+
+FLIGHTS = {
+    "tutorial": (TUTORIAL, True, "--angle-deg", "0"),
+    "one of three": (ASKEW, True, "--tank-l", "5"),
+    "without lines": (TUTORIAL, False, "--angle-deg", "0"),
+}
+
+
+@pytest.fixture(scope="module", params=FLIGHTS)
+def flown(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Flown:
+    zones, lines, *more = FLIGHTS[request.param]
+    return fly(tmp_path_factory.mktemp("judged"), zones, lines, *more)
+
+
+def test_ground_is_what_the_truth_says(flown: Flown) -> None:
+    said, true = flown.contents["verdict"], flown.verdict
+    within = {"abs": AREA * true.field_m2}
+    assert said["area_ha"] * 1e4 == pytest.approx(true.treated_m2, **within)
+    assert said["doubled_m2"] == pytest.approx(true.twice_m2, **within)
+    assert said["untreated_m2"] == pytest.approx(true.bare_m2, **within)
+    assert said["missed_m2"] == pytest.approx(true.missed_m2, **within)
+    assert said["left_m2"] == pytest.approx(true.bare_m2 - true.missed_m2, **within)
+    percent = 100.0 * true.bare_m2 / true.field_m2
+    assert said["untreated_percent"] == pytest.approx(percent, abs=1.0)
+
+
+def test_litres_are_what_the_truth_says(flown: Flown) -> None:
+    said, true = flown.contents["verdict"], flown.verdict
+    for name in ("applied_l", "metered_l", "modelled_l"):
+        assert said[name] == pytest.approx(true.applied_l, rel=LITRES), name
+    assert flown.result["applied_ml"] == pytest.approx(1e3 * true.applied_l, rel=1e-6)
+    assert said["outside_ml"] == pytest.approx(true.outside_ml, abs=0.5)
+    assert flown.result["off_target_ml"] == pytest.approx(true.outside_ml, abs=0.5)
+    assert said["off_line_ml"] == pytest.approx(true.off_line_ml, abs=1.0)
+
+
+def test_asked_applied_and_area_are_of_the_same_ground(flown: Flown) -> None:
+    said, true = flown.contents["verdict"], flown.verdict
+    area = {"rel": 2.0 * AREA * true.field_m2 / true.treated_m2}
+    assert said["asked_rate_l_ha"] == pytest.approx(true.asked_rate_l_ha, rel=0.01)
+    assert said["mean_rate_l_ha"] == pytest.approx(1e4 * true.applied_l / true.treated_m2, **area)
+    rates = {rate for _, rate in flown.field.zones}
+    assert 0.999 * min(rates) <= said["asked_rate_l_ha"] <= 1.001 * max(rates)
+    balance = flown.contents["balance"]
+    assert balance["prescribed_l"] == said["prescribed_l"]
+    assert flown.record["asked_rate_l_ha"]["value"] == round(said["asked_rate_l_ha"], 2)
+    assert flown.record["mean_rate_l_ha"]["value"] == round(said["mean_rate_l_ha"], 2)
+
+
+def test_applied_is_the_sum_of_all_that_fell_on_a_cell(flown: Flown) -> None:
+    cells = flown.assessed.cells
+    assert cells is not None
+    west_m, south_m = float(cells.corner_east_m[0, 0]), float(cells.corner_north_m[0, 0])
+    shape = cells.measured_l_ha.shape
+    true = doses_of([flown.truth], flown.field, west_m, south_m, cells.cell_m, shape)
+    # Nearly whole cells in the field, where no valve is just opening or closing for half of it.
+    whole = (true.ground_m2 > 0.5 * cells.cell_m**2) & np.isfinite(cells.measured_l_ha)
+    off = np.abs(cells.measured_l_ha - true.dose_l_ha)[whole] / true.asked_l_ha[whole]
+    assert np.median(off) < 0.03
+    assert np.percentile(off, 95) < 0.15
+    asked = true.asked_l_ha > 0.0
+    near = asked & (np.abs(true.dose_l_ha - true.asked_l_ha) <= 0.1 * true.asked_l_ha)
+    share = 100.0 * true.ground_m2[near].sum() / true.ground_m2[asked].sum()
+    assert flown.contents["verdict"]["within_10_percent"] == pytest.approx(share, abs=4.0)
+    assert cells.judged_m2 <= 1.001 * flown.verdict.field_m2
+
+
+def test_ground_that_two_passes_sprayed_is_shown_with_both(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    flown = fly(tmp_path_factory.mktemp("twice"), TUTORIAL, False, "--angle-deg", "0")
+    cells = flown.assessed.cells
+    assert cells is not None
+    # A strip of half a metre got two doses: in cells of a metre half as much again.
+    assert np.nanpercentile(cells.relative_error_percent, 95) > 30.0
