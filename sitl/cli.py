@@ -46,6 +46,7 @@ class Corners(StrEnum):
     PX4 = "px4"
 
 
+VEHICLE = "drawn, or flown: as in logs of real flights (gusts, turns, position errors)."
 app = typer.Typer(
     help="The simulated flight: stub autopilot and twin.",
     epilog="Example: vrspray sitl serve --autopilot px4",
@@ -107,7 +108,10 @@ def serve(
         FlowLaw | None,
         typer.Option(help="True flow between measured points; default: the profile's."),
     ] = None,
-    gust: Annotated[float, typer.Option(help="Gusts in m/s.")] = 1.0,
+    vehicle: Annotated[str, typer.Option(help=VEHICLE)] = "drawn",
+    gust: Annotated[
+        float | None, typer.Option(help="Gusts in m/s; default: the vehicle's.")
+    ] = None,
     corners: Annotated[
         Corners | None,
         typer.Option(help="How to fly corners; default: as the autopilot does."),
@@ -155,6 +159,7 @@ def serve(
         board=board.value,
         flow_law=None if flow_law is None else flow_law.value,
         speed_m_s=speed,
+        vehicle=vehicle,
         gust_m_s=gust,
         corners=None if corners is None else corners.value,
         seed=seed,
@@ -212,6 +217,7 @@ def fly(
         Corners | None,
         typer.Option(help="How to fly corners; default: as the configured autopilot does."),
     ] = None,
+    vehicle: Annotated[str, typer.Option(help=VEHICLE)] = "drawn",
     meter_rate_hz: Annotated[
         float, typer.Option(help="How often the flow meter reports; 0: no meter.")
     ] = 50.0,
@@ -241,7 +247,8 @@ def fly(
     from companion.errors import ConfigError
 
     if along is not None:
-        if mission or scenario or fidelity or output or speed or corners or controller:
+        others = mission, scenario, fidelity, output, speed, corners, controller
+        if any(others) or vehicle != "drawn":
             raise ConfigError(
                 "--along goes with --config, --plant, --position-rate-hz, --flights, --seed, --out "
                 "and --json; leave the others out"
@@ -271,6 +278,7 @@ def fly(
         seed=seed,
         speed_m_s=speed,
         corners=None if corners is None else corners.value,
+        vehicle=vehicle,
         meter_rate_hz=meter_rate_hz,
         flow_law=None if flow_law is None else flow_law.value,
         controller=controller,

@@ -39,11 +39,12 @@ from companion.core.types import (
     VehicleState,
 )
 from companion.output.pwm import PulseEngine
+from sitl.airframes import DRAWN, EstimatorNoise
 from sitl.drives import DrivenOutput, DriveTruth, Motors, Ranges
 from sitl.earth import Earth
 from sitl.knowledge import KnowingOutput, WaitingForDuties, WaitingForEdges, pwm_limits
 from sitl.liquid_faults import LiquidFault, LiquidSensors
-from sitl.navigation import SPEED_REPORT_RATE_HZ, WANDER_SD_M, Navigation
+from sitl.navigation import SPEED_REPORT_RATE_HZ, Navigation
 from sitl.outputs import (
     SERVO_FRAME_S,
     WIRE_S,
@@ -97,6 +98,7 @@ class FlightOptions:
     speed_rate_hz: float = SPEED_REPORT_RATE_HZ
     estimator_lag_s: float = 0.031
     noise: bool = True
+    off: EstimatorNoise = DRAWN.noise
     scatter: bool = True
     knows: bool = False
     flow_law: FlowLaw | None = None
@@ -187,7 +189,7 @@ def fly(
         nozzle_sets=() if profile.has_sections else setup.nozzle_sets,
         orders=tuple(output.orders),
         # White noise averages out over some messages; what wanders does not.
-        position_sd_m=WANDER_SD_M if options.noise and not options.knows else 0.0,
+        position_sd_m=options.off.drift_m if options.noise and not options.knows else 0.0,
         meta=FlightMeta(
             speed_m_s=speed_m_s,
             method=method or (setup.method.value if own is None else own.__name__),
@@ -314,6 +316,7 @@ def _inputs(setup: Setup, trajectory: Trajectory, options: FlightOptions) -> Ite
         message_delay_s=MESSAGE_DELAY_S if is_noisy else 0.0,
         jitter_s=0.003 if is_noisy else 0.0,
         noise=is_noisy,
+        off=options.off,
     )
     start_s, end_s = float(trajectory.time_s[0]), float(trajectory.time_s[-1])
     return heapq.merge(

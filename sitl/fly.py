@@ -42,6 +42,7 @@ from companion.core.types import (
 from companion.errors import ConfigError
 from missions.maps.compiling import compiled_setup
 from missions.maps.model import Problem
+from sitl.airframes import DRAWN, Airframe, airframe_of
 from sitl.flight import FlightOptions, FlightResult, fly, true_profile
 from sitl.knowledge import perfect_setup
 from sitl.motor_parts import check_motors, droplet_figures, fits, ranges_us
@@ -86,6 +87,7 @@ class FlyOptions:
     output: Literal["gpio", "servo"] | None = None
     seed: int = 1
     corners: Corners | None = None
+    vehicle: str = "drawn"
     speed_m_s: float | None = None
     meter_rate_hz: float = 50.0
     flow_law: FlowLaw | None = None
@@ -104,6 +106,7 @@ class Task:
     speed_m_s: float
     warnings: tuple[Problem, ...]
     faults: tuple[Fault, ...]
+    airframe: Airframe = DRAWN
     own: MakeController | None = None
 
 
@@ -224,6 +227,7 @@ def prepare(options: FlyOptions) -> Task:
             *_too_short(setup, profile, over),
         ),
         faults=faults,
+        airframe=airframe_of(options.vehicle),
         own=None if options.controller is None else load_controller(options.controller),
     )
 
@@ -359,7 +363,7 @@ def _trajectory(task: Task, seed: int, corners: Corners | None) -> Trajectory:
     flown_by: Corners = "ardupilot" if mission is None else mission.autopilot
     vehicle = Vehicle(
         task.route, start_s=0.0, seed=seed, acceleration_m_s2=acceleration,
-        corners=corners or flown_by,
+        corners=corners or flown_by, airframe=task.airframe,
     )  # fmt: skip
     return vehicle.fly_to_end()
 
@@ -409,6 +413,7 @@ def _flight_options(task: Task, options: FlyOptions) -> FlightOptions:
         meter_rate_hz=options.meter_rate_hz,
         drive_ranges_us=ranges_us(task.config),
         flow_law=options.flow_law,
+        off=task.airframe.noise,
     )
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import heapq
 import math
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from companion.core.types import AttitudeReport, ImuReport, SpeedReport, Telemetry
+from sitl.airframes import DRAWN, EstimatorNoise
 from sitl.trajectory import Trajectory
 from sitl.vehicle import GRAVITY_M_S2, MEAN_S, Leaning, leaning
 
@@ -18,11 +19,6 @@ if TYPE_CHECKING:
     from sitl.earth import Earth
     from sitl.trajectory import Truth
 
-# RTK: white noise, and a part that wanders; from the accuracy that receivers state (1 cm + 1 ppm).
-WHITE_SD_M = 0.014
-WANDER_SD_M = 0.014
-WANDER_TIME_S = 30.0
-VELOCITY_SD_M_S = 0.03
 SPEED_REPORT_RATE_HZ = 10.0
 # What an estimator's attitude is off by: it wanders as its accelerometer's bias is learned.
 TILT_SD_RAD, TILT_TIME_S = math.radians(0.4), 30.0
@@ -62,6 +58,7 @@ class Navigation:
         message_delay_s: float = 0.005,
         jitter_s: float = 0.003,
         noise: bool = True,
+        off: EstimatorNoise = DRAWN.noise,
         boot_s: float = 0.0,
         imu_rate_hz: float = 0.0,
         speed_rate_hz: float = SPEED_REPORT_RATE_HZ,
@@ -76,9 +73,10 @@ class Navigation:
         self._lag_s, self._delay_s, self._jitter_s = estimator_lag_s, message_delay_s, jitter_s
         self._noise = 1.0 if noise else 0.0
         self._start_s, self._boot_s = start_s, boot_s
-        decay = math.exp(-self._period_s / WANDER_TIME_S)
-        self._decay, self._kick = decay, WANDER_SD_M * math.sqrt(1.0 - decay**2)
-        position_seed, speed_seed, imu_seed = np.random.SeedSequence(seed).spawn(3)
+        self._off, self._kept = off, off.kept(self._period_s)
+        position_seed, speed_seed, imu_seed, drift_seed = np.random.SeedSequence(seed).spawn(4)
+        self._drift_rng = np.random.default_rng(drift_seed)
+        self._pace_off: Any = off.velocity_drift_m_s * self._drift_rng.standard_normal(2)
         self._position_rng = np.random.default_rng(position_seed)
         self._speed_rng = np.random.default_rng(speed_seed)
         self._speed_rate_hz, self._imu_rate_hz = speed_rate_hz, imu_rate_hz
@@ -89,7 +87,7 @@ class Navigation:
         self._imu_count = 0
         self._imu_received_s = -math.inf
         east, north = self._position_rng.standard_normal(2).tolist()
-        self._wander = (WANDER_SD_M * east, WANDER_SD_M * north)
+        self._wander = (off.drift_m * east, off.drift_m * north)
         self._position_count = self._speed_count = self._order = 0
         self._position_received_s = self._speed_received_s = -math.inf
         self._under_way: list[tuple[float, int, Heard]] = []
@@ -116,7 +114,9 @@ class Navigation:
         east_m, north_m = self._positions(truths, draws)
         places = self._earth.to_geographic_all(east_m, north_m)
         latitudes, longitudes = (np.asarray(each).tolist() for each in places)
-        velocity = (draws[:, 4:7] * (VELOCITY_SD_M_S * self._noise)).tolist()
+        off_m_s = self._off.velocity_m_s * draws[:, 4:7]
+        off_m_s[:, :2] += self._paces_off(len(times_s))
+        velocity = (self._noise * off_m_s).tolist()
         jitter = draws[:, 7].tolist()
         for i, truth in enumerate(truths):
             received_s = self._receive_s(times_s[i], jitter[i], self._position_received_s)
@@ -141,13 +141,23 @@ class Navigation:
         self, truths: list[Truth], draws: NDArray[np.float64]
     ) -> tuple[list[float], list[float]]:
         east_m, north_m = [], []
-        (east, north), decay, kick, noise = self._wander, self._decay, self._kick, self._noise
+        (east, north), (decay, _, kick, _), noise = self._wander, self._kept, self._noise
+        white_m = self._off.white_m
         for truth, draw in zip(truths, draws[:, :4].tolist(), strict=True):
             east, north = decay * east + kick * draw[2], decay * north + kick * draw[3]
-            east_m.append(truth.east_m + noise * (east + WHITE_SD_M * draw[0]))
-            north_m.append(truth.north_m + noise * (north + WHITE_SD_M * draw[1]))
+            east_m.append(truth.east_m + noise * (east + white_m * draw[0]))
+            north_m.append(truth.north_m + noise * (north + white_m * draw[1]))
         self._wander = (east, north)
         return east_m, north_m
+
+    def _paces_off(self, count: int) -> NDArray[np.float64]:
+        """Return how far the velocities of the next messages have drifted, north and east."""
+        _, keep, _, kick = self._kept
+        found = []
+        for draw in self._drift_rng.standard_normal((count, 2)):
+            self._pace_off = keep * self._pace_off + kick * draw
+            found.append(self._pace_off)
+        return np.array(found)
 
     def _truths(self, sent_s: list[float]) -> list[Truth]:
         """Return what the messages sent at these times tell of."""
@@ -169,7 +179,7 @@ class Navigation:
         truths = self._truths(times_s)
         for at_s, truth, (error, jitter) in zip(times_s, truths, draws, strict=True):
             speed_m_s = math.hypot(truth.velocity_east_m_s, truth.velocity_north_m_s)
-            speed_m_s = abs(speed_m_s + VELOCITY_SD_M_S * self._noise * error)
+            speed_m_s = abs(speed_m_s + self._off.velocity_m_s * self._noise * error)
             received_s = self._receive_s(at_s, jitter, self._speed_received_s)
             self._speed_received_s = received_s
             self._put(received_s, SpeedReport(received_s=received_s, ground_speed_m_s=speed_m_s))

@@ -24,6 +24,7 @@ from companion.core.setup import Setup
 from companion.core.types import TimedChange
 from companion.errors import ConfigError
 from missions.maps.compiling import compiled_setup
+from sitl.airframes import airframe_of
 from sitl.anyang import EXAMPLE
 from sitl.earth import Earth
 from sitl.follow import Along, Told, along
@@ -237,7 +238,8 @@ class ServeOptions:
     board: BoardKind = "restarting"
     flow_law: FlowLaw | None = None
     speed_m_s: float = 5.0
-    gust_m_s: float = 1.0
+    gust_m_s: float | None = None
+    vehicle: str = "drawn"
     corners: Corners | None = None
     seed: int = 0
     out: Path | None = None
@@ -270,7 +272,7 @@ class _Run:
     """
 
     def __init__(self, options: ServeOptions, say: Say, *, start_s: float | None = None) -> None:
-        if not 0.0 <= options.gust_m_s <= 10.0:
+        if not 0.0 <= (options.gust_m_s or 0.0) <= 10.0:
             raise ConfigError(f"--gust {options.gust_m_s:g}: give 0 to 10 m/s")
         if options.wait_s is not None and not options.wait_s >= 0.0:
             raise ConfigError(f"--wait-s {options.wait_s:g}: give 0 or more seconds")
@@ -294,6 +296,7 @@ class _Run:
                 items=items,
                 heading_deg=first_course_deg(items, home),
                 speed_m_s=options.speed_m_s,
+                airframe=airframe_of(options.vehicle),
                 gust_m_s=options.gust_m_s,
                 corners=options.corners or ("px4" if options.autopilot == "px4" else "ardupilot"),
                 scenario=scenario,

@@ -15,6 +15,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
+from sitl.airframes import DRAWN, Airframe
 from sitl.guidance import STEP_S, ArduCopter, Guidance, Px4
 from sitl.trajectory import Leg, Route, Trajectory, Truth, lines_of
 
@@ -85,9 +86,6 @@ STRAIGHT_DEG = 5.0
 # along-track speed: sd = drag / sqrt(gain (gain + 1 / time)).
 SPEED_GAIN_1_S = 2.0
 DRAG_1_S = 0.346
-# Cross-track: a critically damped position controller, driven so that 1 m/s of gust makes 3 cm.
-CROSS_RATE_1_S = 1.5
-CROSS_SD_M = 0.03
 # Whom an autopilot holds to a place on its way, the same gusts push against a spring: the drag is
 # such that their speed is as large as without it (from the Lyapunov equation of both).
 HELD_SPRING_1_S2, HELD_DRAG_1_S = 2.0, 0.505
@@ -112,11 +110,14 @@ class Vehicle:
         start_s: float,
         seed: int,
         acceleration_m_s2: float = 2.5,
-        gust_m_s: float = 1.0,
-        gust_time_s: float = 1.5,
+        gust_m_s: float | None = None,
+        gust_time_s: float | None = None,
+        airframe: Airframe = DRAWN,
         heading: Literal["course"] | float = "course",
         corners: Corners = "stop",
     ) -> None:
+        gust_m_s = airframe.gust_m_s if gust_m_s is None else gust_m_s
+        gust_time_s = airframe.gust_time_s if gust_time_s is None else gust_time_s
         if not (acceleration_m_s2 > 0.0 and gust_m_s >= 0.0 and gust_time_s > 0.0):
             raise ValueError("acceleration and gust time must be positive, gusts not negative")
         self.route = route
@@ -124,7 +125,11 @@ class Vehicle:
         self._acceleration = acceleration_m_s2
         self._decay = math.exp(-STEP_S / gust_time_s)
         self._kick = gust_m_s * math.sqrt(1.0 - self._decay**2)
-        self._cross_kick = gust_m_s * CROSS_SD_M * math.sqrt(4.0 * CROSS_RATE_1_S**3 * STEP_S)
+        rate = airframe.cross_rate_1_s
+        driven_m = gust_m_s * airframe.cross_sd_m
+        self._cross_kick = driven_m * math.sqrt(4.0 * rate**3 * STEP_S)
+        # Spring and damper of one step.
+        self._cross_held = rate**2 * STEP_S, 2.0 * rate * STEP_S
         self._rng = np.random.default_rng(seed)
         self._noise: list[tuple[float, float]] = []
         self._fixed_heading_deg = None if heading == "course" else float(heading)
@@ -132,6 +137,9 @@ class Vehicle:
         self._leg = 0
         self._turning = False
         self._led: Guidance | None = None
+        if corners == "stop" and airframe.guided:
+            corners = "ardupilot"
+        self._turned_deg, self._nose_gain = 0.0, airframe.nose_gain_deg_s2
         if corners != "stop":
             self._led = (ArduCopter if corners == "ardupilot" else Px4)(route, acceleration_m_s2)
         self._pushed = (0.0, 0.0, 0.0, 0.0)  # along, its speed, across, its speed
@@ -280,7 +288,7 @@ class Vehicle:
         cross, cross_speed = self._cross_m, self._cross_speed
         leg, heading, decay, draw = self._leg, self._heading_deg, self._decay, self._draw
         append, sqrt = self._history.append, math.sqrt
-        spring, damper = CROSS_RATE_1_S**2 * STEP_S, 2.0 * CROSS_RATE_1_S * STEP_S
+        spring, damper = self._cross_held
         gain, drag = SPEED_GAIN_1_S * STEP_S, DRAG_1_S * STEP_S
         while steps > 0 and along < length_m:
             steps -= 1
@@ -303,7 +311,7 @@ class Vehicle:
     def _follow(self, led: Guidance, steps: int) -> None:
         """Fly as an autopilot leads, for up to `steps`; gusts push the copter off that way."""
         along, along_speed, across, across_speed = self._pushed
-        spring, damper = CROSS_RATE_1_S**2 * STEP_S, 2.0 * CROSS_RATE_1_S * STEP_S
+        spring, damper = self._cross_held
         for _ in range(steps):
             leg = led.leg
             led.step()
@@ -349,7 +357,15 @@ class Vehicle:
         target_deg = math.degrees(math.atan2(led.lead_east_m_s, led.lead_north_m_s))
         left_deg = (target_deg - self._heading_deg + 180.0) % 360.0 - 180.0
         most_deg = led.nose_deg_s * STEP_S
-        self._heading_deg += min(max(left_deg, -most_deg), most_deg)
+        turned_deg = min(max(left_deg, -most_deg), most_deg)
+        if self._nose_gain < math.inf:
+            # No faster than it can still come to rest from, and its rate takes time to change.
+            stops_deg = math.sqrt(2.0 * self._nose_gain * abs(left_deg)) * STEP_S
+            turned_deg = min(max(turned_deg, -stops_deg), stops_deg)
+            change_deg, before_deg = self._nose_gain * STEP_S**2, self._turned_deg
+            turned_deg = min(max(turned_deg, before_deg - change_deg), before_deg + change_deg)
+            self._turned_deg = turned_deg
+        self._heading_deg += turned_deg
 
     def _end_leg(self) -> None:
         if self._bend_deg(self._leg) < STRAIGHT_DEG:
@@ -374,7 +390,7 @@ class Vehicle:
         is_last = self._leg + 1 >= len(self._legs)
         target_deg = self._heading_deg if is_last else self._course_of(self._leg + 1)
         most_deg, most = TURN_RATE_DEG_S * STEP_S, self._acceleration * STEP_S
-        spring, damper = CROSS_RATE_1_S**2 * STEP_S, 2.0 * CROSS_RATE_1_S * STEP_S
+        spring, damper = self._cross_held
         while steps > 0:
             left_deg = (target_deg - self._heading_deg + 180.0) % 360.0 - 180.0
             if left_deg == 0.0 and self._speed == 0.0:

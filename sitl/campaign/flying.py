@@ -19,6 +19,7 @@ from analysis.strips import strips_of
 from companion.config import load
 from companion.errors import ConfigError
 from missions.maps.compiling import compiled_setup
+from sitl.airframes import Airframe, airframe_of
 from sitl.anyang import (
     ACCELERATION_M_S2,
     EXAMPLE,
@@ -302,10 +303,15 @@ def _path(settings: Settings, seed: int, folder: Path) -> Trajectory:
         start_s=start_s,
         seed=seed,
         acceleration_m_s2=cast(float, given.get("vehicle.acceleration_m_s2", acceleration)),
-        gust_m_s=cast(float, given.get("vehicle.gust_m_s", 1.0)),
-        gust_time_s=cast(float, given.get("vehicle.gust_time_s", 1.5)),
+        gust_m_s=cast(Any, given.get("vehicle.gust_m_s")),
+        gust_time_s=cast(Any, given.get("vehicle.gust_time_s")),
+        airframe=_airframe(given),
         corners=cast(Any, given.get("vehicle.corners", corners)),
     ).fly_to_end()
+
+
+def _airframe(given: Mapping[str, Value]) -> Airframe:
+    return airframe_of(str(given.get("vehicle.kind", "drawn")))
 
 
 def _error(given: Mapping[str, Value]) -> Disturbance:
@@ -327,6 +333,7 @@ def _options(scene: _Scene, given: Mapping[str, Value], seed: int) -> FlightOpti
         "position_rate_hz": given.get("vehicle.position_rate_hz", rate_hz),
         "estimator_lag_s": given.get("vehicle.estimator_lag_s", 0.031),
         "noise": given.get("vehicle.noise", True),
+        "off": _airframe(given).noise,
         "scatter": given.get("plant.scatter", True),
         "flow_law": given.get("plant.flow_law"),
         "meter_rate_hz": given.get("flight.meter_rate_hz", 0.0 if scene.on_p1s_field else 50.0),

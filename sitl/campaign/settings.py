@@ -14,6 +14,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, Literal, get_args
 
 from companion.errors import ConfigError
+from sitl.airframes import AIRFRAMES
 from sitl.conditions import BORDER, CONDITIONS, INSIDE
 from sitl.profile import FlowLaw, Meter, PlantProfile, Pulsing, Pump
 from sitl.supply import Supply
@@ -56,6 +57,7 @@ KINDS: dict[str, Kind] = {
     "flight.meter_rate_hz": _number(0.0, 1000.0),
     "flight.perfect": Kind(bool),
     "flight.cpu_max_s": _number(1.0, 1_000_000.0),
+    "vehicle.kind": Kind(str, tuple(AIRFRAMES)),
     "vehicle.speed_m_s": _number(0.5, 30.0),
     "vehicle.acceleration_m_s2": _number(0.1, 20.0),
     "vehicle.gust_m_s": _number(0.0, 20.0),
@@ -89,8 +91,8 @@ ON_P1S_FIELD = (
 )  # fmt: skip
 # A hard condition has its own rates and its own way of flying; files have their own field.
 NOT_IN_CONDITIONS = (
-    *ON_P1S_FIELD, "map.rate_factor", "vehicle.speed_m_s", "vehicle.acceleration_m_s2",
-    "vehicle.gust_m_s", "vehicle.gust_time_s", "vehicle.corners",
+    *ON_P1S_FIELD, "map.rate_factor", "vehicle.kind", "vehicle.speed_m_s",
+    "vehicle.acceleration_m_s2", "vehicle.gust_m_s", "vehicle.gust_time_s", "vehicle.corners",
 )  # fmt: skip
 # What that field's flights take from elsewhere: varying it would show a flat line.
 NOT_ON_P1S_FIELD = {

@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass, replace
 from enum import Enum
 
+from sitl.airframes import DRAWN, Airframe
 from sitl.earth import Earth
 from sitl.stub.mission_items import (
     ABSOLUTE_FRAMES,
@@ -54,7 +55,7 @@ class Flight:
         parameters: Parameters,
         *,
         home_altitude_m: float,
-        gust_m_s: float = 1.0,
+        airframe: Airframe = DRAWN,
         seed: int = 0,
         zero_is_a_place: bool = False,
         corners: Corners = "stop",
@@ -70,7 +71,7 @@ class Flight:
         self.mission_complete = False
         self.events: list[FlightEvent] = []
         self._parameters = parameters
-        self._gust_m_s = gust_m_s
+        self._airframe = airframe
         self._zero_is_a_place = zero_is_a_place
         self._seed = seed
         self._corners = corners
@@ -248,7 +249,7 @@ class Flight:
     def _begin_route(self, pose: Pose, legs: tuple[Leg, ...]) -> None:
         self._seed += 1
         self._route = RouteFlight(
-            pose, legs, gust_m_s=self._gust_m_s, seed=self._seed, corners=self._corners
+            pose, legs, airframe=self._airframe, seed=self._seed, corners=self._corners
         )
         self.world.begin(self._route, now_s=pose.time_s)
         self.phase = Phase.ROUTE

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from companion.errors import ConfigError
+from sitl.airframes import EstimatorNoise
 from sitl.stub.faults import Fault, FaultKind, read_faults, read_table
 from sitl.stub.firmware import Version
 from sitl.stub.sprayer import LiquidEntry, read_liquid
-from sitl.stub.world import EstimatorNoise
 
 _KNOWN: dict[str, tuple[str, ...]] = {
     "firmware": ("version", "commands_per_s"),

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.errors import ConfigError, LinkError
+from sitl.airframes import DRAWN, Airframe, EstimatorNoise
 from sitl.earth import Earth
 from sitl.stub.ardupilot import ardupilot
 from sitl.stub.autopilot import Autopilot
@@ -31,7 +32,7 @@ from sitl.stub.px4 import COMMANDS_PER_S, nan_keeps, px4, px4_parameters
 from sitl.stub.scenario import Scenario
 from sitl.stub.sprayer import Sprayer
 from sitl.stub.watchdog import Watchdog, Watched
-from sitl.stub.world import ARDUPILOT_NOISE, PX4_NOISE, Estimator, EstimatorNoise, Pose, World
+from sitl.stub.world import ARDUPILOT_NOISE, PX4_NOISE, Estimator, Pose, World
 from sitl.vehicle import Corners
 
 # ------------------------------------------------------------------------------------- put together
@@ -55,7 +56,8 @@ class StubOptions:
     heading_deg: float = 0.0
     items: tuple[MissionItem, ...] = ()
     speed_m_s: float = 5.0
-    gust_m_s: float = 1.0
+    airframe: Airframe = DRAWN
+    gust_m_s: float | None = None
     corners: Corners = "stop"
     noise: EstimatorNoise | None = None
     scenario: Scenario = field(default_factory=Scenario)
@@ -82,7 +84,11 @@ def build_autopilot(
         options.home,
         parameters,
         home_altitude_m=options.home_altitude_m,
-        gust_m_s=options.gust_m_s,
+        airframe=(
+            options.airframe
+            if options.gust_m_s is None
+            else replace(options.airframe, gust_m_s=options.gust_m_s)
+        ),
         seed=options.seed,
         zero_is_a_place=firmware.zero_is_a_place,
         corners=options.corners,
@@ -149,7 +155,9 @@ def noise_of(options: StubOptions) -> EstimatorNoise:
     """Return how far the position is from the truth."""
     if options.noise is not None:
         return options.noise
-    own = PX4_NOISE if options.autopilot == "px4" else ARDUPILOT_NOISE
+    own = options.airframe.noise
+    if own == ARDUPILOT_NOISE and options.autopilot == "px4":
+        own = PX4_NOISE
     return replace(own, **options.scenario.position)
 
 

@@ -21,6 +21,8 @@ MEANINGS: dict[str, str] = {
     "position.drift_m": "slow noise",
     "position.drift_time_s": "time constant of the slow noise",
     "position.velocity_m_s": "noise of the velocity",
+    "position.velocity_drift_m_s": "a velocity error that drifts (1 sd); 0",
+    "position.velocity_drift_time_s": "and its time constant; 30",
     "clock.drift_ppm": "how fast the vehicle's clock drifts",
     "clock.uptime_s": "for how long it has run; it wraps at 4294967.296",
     "wind.speed_m_s": "the wind that the vehicle reports; nothing is blown away",
