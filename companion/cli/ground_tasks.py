@@ -23,7 +23,7 @@ from companion.ground.work import (
 
 # Where no pump says how long its hoses take.
 PRIME_S = 10.0
-FLUSH_EACH_S = 5.0
+FLUSH_EACH_S, CATCH_S = 5.0, 25.0
 
 
 class GroundOptionError(VrsprayError):
@@ -151,7 +151,7 @@ def _seconds(config: Config, wish: Wish, valves: Sequence[int]) -> float:
     if wish.kind is GroundKind.FLUSH:
         return min(FLUSH_EACH_S * (1 if wish.is_together else len(valves)), PIECE_MAX_S)
     if wish.kind is GroundKind.CATCH:
-        return PIECE_MAX_S
+        return CATCH_S
     if wish.litres is None:
         raise GroundOptionError("rinse: give --litres, or --seconds")
     # In turn each valve is open for the same time, so that their mean flow counts.

@@ -362,6 +362,9 @@ def _of_landed(state: GroundState, now_s: float) -> list[GroundReason]:
 
 
 def _of_order(order: GroundOrder, memory: GroundMemory, now_s: float) -> frozenset[GroundReason]:
+    if not _done_s(memory, now_s) < order.task.seconds - _BIT_S:
+        # A piece as long as may be ends by its time and by the limit at once: it is done.
+        return frozenset({GroundReason.DONE})
     found = []
     hold = order.hold
     is_fresh = hold.first_s >= order.started_s and hold.first_s >= memory.anew_s
@@ -371,9 +374,7 @@ def _of_order(order: GroundOrder, memory: GroundMemory, now_s: float) -> frozens
     until_s = order.started_s + START_MAX_S if began_s is None else began_s + PIECE_MAX_S
     if not (order.started_s == memory.started_s and order.started_s <= now_s < until_s):
         found.append(GroundReason.TIME_OVER)
-    if not _done_s(memory, now_s) < order.task.seconds - _BIT_S:
-        found.append(GroundReason.DONE)
-    elif memory.since_s is None and began_s is not None and order.task.is_whole and not found:
+    if memory.since_s is None and began_s is not None and order.task.is_whole and not found:
         found.append(GroundReason.STALLED)
     return frozenset(found)
 

@@ -153,12 +153,12 @@ PUMPS = Path(__file__).parents[2] / "examples"
 def test_a_pump_that_makes_the_flow_takes_the_duty_and_the_valves_are_open() -> None:
     settings = load(PUMPS / "pump-sections" / "config.toml")
     assert settings.pump is not None
-    caught = piece_of(settings, Wish(kind=GroundKind.CATCH, duty=0.8, seconds=30.0))
+    caught = piece_of(settings, Wish(kind=GroundKind.CATCH, duty=0.8))
     assert set(caught.task.phases[0].duty) == {1.0}
     assert caught.task.drives[0] == caught.duty == 0.8
     (nozzles,) = settings.nozzle_sets()
     assert caught.expected_ml(settings) == pytest.approx(
-        nozzles.curve.flow_for(0.8) * 500.0, rel=0.05
+        nozzles.curve.flow_for(0.8) * 1000.0 * 25.0 / 60.0, rel=0.05
     )
     assert piece_of(settings, Wish(kind=GroundKind.CLICK)).task.drives == ()
     prime = piece_of(settings, Wish(kind=GroundKind.PRIME))

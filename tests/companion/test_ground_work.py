@@ -18,6 +18,7 @@ from companion.core.types import (
     SpeedReport,
 )
 from companion.ground.work import (
+    PIECE_MAX_S,
     GroundDecision,
     GroundKind,
     GroundMemory,
@@ -383,6 +384,16 @@ def test_the_piece_ends_at_its_time_and_the_lease_with_it() -> None:
     assert end.reasons == {GroundReason.DONE}
     assert end.is_over
     assert end.done_s == pytest.approx(10.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", [GroundKind.PRIME, GroundKind.FLUSH, GroundKind.CATCH])
+def test_a_piece_as_long_as_may_be_is_done_and_not_out_of_time(kind: GroundKind) -> None:
+    task = together(kind, 3, (0,), duty=1.0, seconds=PIECE_MAX_S)
+    bench = Bench(task).pressed(-0.1, 0.0)
+    while not (end := bench.step(bench.now_s + 0.0503)).is_over:
+        assert bench.now_s < NOW_S + 2.0 * PIECE_MAX_S
+    assert end.reasons == {GroundReason.DONE}
+    assert end.done_s == pytest.approx(PIECE_MAX_S, abs=0.06)
 
 
 def test_after_thirty_seconds_in_all_it_needs_a_new_start() -> None:
