@@ -16,7 +16,7 @@ from companion.cli.answer import AsJson, answer, note
 from companion.cli.app import load_command
 from companion.commands import Command
 from companion.errors import ConfigError, JournalError, VrsprayError
-from companion.wording import install_command
+from companion.wording import missing
 
 if TYPE_CHECKING:
     from typer._click.core import Command as ClickCommand
@@ -103,7 +103,7 @@ def lag(
         try:
             draw(found, plot)
         except ImportError:
-            note(f"no picture: matplotlib is missing; {install_command('office')}")
+            note(f"no picture: {missing('matplotlib')}")
         except (OSError, ValueError) as error:
             raise ConfigError(f"--plot {plot}: cannot be written ({error})") from error
     result = lag_result(found)

@@ -10,7 +10,7 @@ import numpy as np
 
 from analysis.csv_rows import TableError
 from analysis.swath import lanes
-from companion.wording import install_command
+from companion.wording import missing
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -265,7 +265,7 @@ def _axes(path: Path) -> Iterator[Axes]:
 def _figure(path: Path, height_in: float = 4.2) -> Iterator[Figure]:
     """Give a figure to draw on, and write it to `path` at the end."""
     if importlib.util.find_spec("matplotlib") is None:
-        raise TableError(f"no picture without matplotlib; {install_command('office')}")
+        raise TableError(missing("matplotlib"))
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

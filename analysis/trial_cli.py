@@ -18,7 +18,7 @@ from companion.atomic_write import write_atomically
 from companion.cli.answer import AsJson, answer, note
 from companion.csv_table import csv_of
 from companion.errors import VrsprayError
-from companion.wording import counted, install_command
+from companion.wording import counted, missing
 
 if TYPE_CHECKING:
     from analysis.strips import Strip
@@ -100,7 +100,7 @@ def evaluate_trial(
     if (harvest is None) != (value is None):
         raise typer.BadParameter("--harvest and --value go together")
     if harvest is not None and importlib.util.find_spec("statsmodels") is None:
-        raise TrialError(f"comparing yields needs statsmodels; {install_command('office')}")
+        raise TrialError(missing("statsmodels"))
     trial, features = read_trial(plots_file)
     strips, frame = _flown(journals)
     plots = local_plots(features, frame)

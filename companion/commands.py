@@ -15,7 +15,7 @@ from importlib.util import find_spec
 from typing import Any, Literal
 
 from companion.errors import VrsprayError
-from companion.wording import install_command
+from companion.wording import missing
 
 GROUP = "vrspray.commands"
 # Whose commands come first where two distributions name the same one.
@@ -91,8 +91,7 @@ def load(name: str, target: str | EntryPoint) -> Any:
         return getattr(import_module(module_name), attribute)
     except ModuleNotFoundError as error:
         raise VrsprayError(
-            f"vrspray {name}: the module {error.name} is not part of this installation; "
-            f"add what the office needs: {install_command('office')}"
+            f"vrspray {name}: {missing(str(error.name).partition('.')[0])}"
         ) from error
     except (ImportError, AttributeError) as error:
         raise VrsprayError(

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple, Protocol
 
 from companion.core.types import FlowReport, Input
 from companion.errors import SensorError
-from companion.wording import install_command
+from companion.wording import missing
 
 # --------------------------------------------------------------------------------------------- flow
 
@@ -338,9 +338,7 @@ class I2cVoltage:
             # It need not be there, and where it is the ignore is not used.
             import smbus2  # type: ignore[import-not-found, unused-ignore]
         except ImportError as error:
-            raise SensorError(
-                f'source = "i2c" needs the module smbus2: {install_command("vehicle")}'
-            ) from error
+            raise SensorError(f'source = "i2c": {missing("smbus2", "vehicle")}') from error
         bus, address = self._where
         try:
             self._bus = smbus2.SMBus(bus)

@@ -37,11 +37,26 @@ def install_command(role: Role, prefix: str = sys.prefix) -> str:
     "uv pip install --python /opt/uv/tools/vrspray/bin/python 'vrspray[vehicle]'"
     """
     wanted, (*_, above, folder, _) = f"'vrspray[{role}]'", ("", "", *PurePath(prefix).parts)
-    if (above, folder) == ("pipx", "venvs"):
+    # Either may be told to have its environments elsewhere.
+    if (above, folder) == ("pipx", "venvs") or Path(prefix, "pipx_metadata.json").exists():
         return f"pipx runpip vrspray install {wanted}"
-    if (above, folder) == ("uv", "tools"):
+    if (above, folder) == ("uv", "tools") or Path(prefix, "uv-receipt.toml").exists():
         return f"uv pip install --python {prefix}/bin/python {wanted}"
     return f"pip install {wanted}"
+
+
+def lack_of(library: str, role: Role = "office") -> tuple[str, str]:
+    """Return that a library is not installed, and what to do."""
+    return f"the library {library} is not installed", f"add it: {install_command(role)}"
+
+
+def missing(library: str, role: Role = "office") -> str:
+    """Return the same in one line.
+
+    >>> missing("jinja2")
+    "the library jinja2 is not installed; add it: pip install 'vrspray[office]'"
+    """
+    return "; ".join(lack_of(library, role))
 
 
 VALUE_LENGTH_MAX = 60

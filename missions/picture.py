@@ -17,7 +17,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from companion.map_pictures import draw_below
-from companion.wording import counted, install_command
+from companion.wording import counted, missing
 from missions.boom import boom_of
 from missions.errors import PlanError
 from missions.field import Kind
@@ -43,7 +43,7 @@ def check_picture(out: Path) -> None:
     if out.suffix.casefold() not in SUFFIXES:
         raise PlanError(f"--png {out}: pictures are written as {', '.join(SUFFIXES)}")
     if importlib.util.find_spec("matplotlib") is None:
-        raise PlanError(f"no picture without matplotlib; {install_command('office')}")
+        raise PlanError(missing("matplotlib"))
 
 
 def draw_plan(plan: Plan, out: Path, *, title: str) -> None:

@@ -24,7 +24,7 @@ from rich.table import Table
 from companion.cli.answer import AsJson, answer, note, progress
 from companion.cli.terminal import terminal, visible
 from companion.errors import ConfigError
-from companion.wording import install_command
+from companion.wording import missing
 from sitl.cli import FlowLaw
 from sitl.workers import termination_as_interrupt
 
@@ -151,7 +151,7 @@ def _write(result: DemoResult, found: dict[str, Any], stage: Path) -> list[str]:
 
     pictures: Sequence[str] = ()
     if importlib.util.find_spec("matplotlib") is None:
-        note(f"no pictures: matplotlib is missing; {install_command('office')}")
+        note(f"no pictures: {missing('matplotlib')}")
     else:
         from sitl.demo_pictures import draw_pictures
 
@@ -163,8 +163,7 @@ def _write(result: DemoResult, found: dict[str, Any], stage: Path) -> list[str]:
     if can_report():
         write_report(stage / JOURNAL, stage / FLIGHT_REPORT)
     else:
-        missing = "jinja2 or matplotlib is missing"
-        note(f"no report of the flight: {missing}; {install_command('office')}")
+        note(f"no report of the flight: {missing('jinja2 or matplotlib')}")
     return [name for name in FILES if (stage / name).exists()]
 
 

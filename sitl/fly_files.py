@@ -14,7 +14,7 @@ from companion.core.types import Decision
 from companion.errors import ConfigError
 from companion.journal.journal import Journal
 from companion.simulated import SIMULATED, Simulated
-from companion.wording import install_command
+from companion.wording import missing
 from sitl.deposit import Deposit
 
 if TYPE_CHECKING:
@@ -173,7 +173,7 @@ def draw(
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError:
-        say(f"no picture: matplotlib is missing; {install_command('office')}")
+        say(f"no picture: {missing('matplotlib')}")
         return []
     record = next(iter(records.values()))
     figure = Figure(figsize=(12, 9), layout="constrained")

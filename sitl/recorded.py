@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from companion.errors import ConfigError
 from companion.flight_modes import COPTER
-from companion.wording import counted, install_command
+from companion.wording import counted, missing
 from sitl.earth import Earth
 from sitl.smoother import true_path
 from sitl.stub.protocol import AUTOPILOT_COMPONENT, Listener, sender
@@ -355,7 +355,7 @@ def _ulog(path: Path) -> Recorded:
     try:
         from pyulog import ULog
     except ImportError:
-        raise ConfigError(f"{path}: reading it needs pyulog; {install_command('office')}") from None
+        raise ConfigError(f"{path}: {missing('pyulog')}") from None
     topics = ["vehicle_local_position", "vehicle_status", "vehicle_gps_position"]
     with path.open("rb") as file:
         found = ULog(file, topics).data_list

@@ -13,7 +13,6 @@ import typer
 from analysis.exports.output import ExportError
 from analysis.exports.source import Shape
 from companion.cli.answer import AsJson, answer, note
-from companion.wording import install_command
 
 if TYPE_CHECKING:
     from analysis.exports.columns import System
@@ -48,13 +47,7 @@ class Format:
     def maker(self) -> Make:
         """Return the function that makes it, imported now."""
         module, _, function = self.make.partition(":")
-        try:
-            found: Make = getattr(import_module(_MODULES + module), function)
-        except ModuleNotFoundError as error:
-            raise ExportError(
-                f"{self.name}: the module {error.name} is not installed; "
-                f"{install_command('office')}"
-            ) from error
+        found: Make = getattr(import_module(_MODULES + module), function)
         return found
 
 

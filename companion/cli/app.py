@@ -37,6 +37,7 @@ from companion.errors import (
     UnreadableError,
     VrsprayError,
 )
+from companion.wording import missing
 
 if TYPE_CHECKING:
     from typer._click.core import Command as ClickCommand
@@ -282,6 +283,8 @@ def _executed(arguments: Sequence[str]) -> int:
             raise
         _close_stdout()
         return _fail(f"{_place_of(error)}: {_ROOM_FIX}", FAILED, as_json=False)
+    except ModuleNotFoundError as error:
+        return _fail(missing(str(error.name).partition(".")[0]), REFUSED, as_json=as_json)
     except (typer.TyperException, VrsprayError, MemoryError, KeyboardInterrupt, typer.Abort) as end:
         return _ended(end, as_json=as_json)
     if result == INTERRUPTED:  # Typer makes an exit of an interrupt

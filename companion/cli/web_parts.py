@@ -30,7 +30,7 @@ from companion.ports import Recorder
 from companion.web import Obey, OperatorPage, Order, Outcome, listen, map_object
 from companion.web.guard import Doors, Tokens, is_loopback, kept_tokens, new_tokens
 from companion.web.page import number
-from companion.wording import install_command
+from companion.wording import missing
 
 TOKENS_NAME = "page-tokens.json"
 WAY_NAME = "page-track.jsonl"
@@ -96,12 +96,9 @@ def build_page(
 ) -> OperatorPage:
     """Return the page, listening but not yet started."""
     web = config.web
-    missing = [name for name in _LIBRARIES if find_spec(name) is None]
-    if missing:
-        raise ConfigError(
-            f"{config.path}: web.enabled: the Python package {missing[0]} is missing: "
-            f"{install_command('vehicle')}"
-        )
+    absent = [name for name in _LIBRARIES if find_spec(name) is None]
+    if absent:
+        raise ConfigError(f"{config.path}: web.enabled: {missing(absent[0], 'vehicle')}")
     doors = doors_of(config)
     tokens = kept_tokens(tokens_file(config))
     certificate, key = _tls_files(config)

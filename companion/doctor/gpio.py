@@ -58,7 +58,7 @@ def read_chip(name: str, numbers: tuple[int, ...]) -> Chip:
     try:
         lines = _lines(load_gpiod(), name, numbers)
     except ActuatorError as error:
-        text, found, _ = str(error).partition(f": {install_command('vehicle')}")
+        text, found, _ = str(error).partition(f"; add it: {install_command('vehicle')}")
         correct = "correct output.chip; gpiodetect lists the chips"
         fix = install_command("vehicle") if found else correct
         return Chip(name=name, problem=text, fix=fix)

@@ -24,7 +24,7 @@ from companion.cli.answer import (
 from companion.config import load
 from companion.errors import Problem
 from companion.flight_map import is_flight_map
-from companion.wording import counted, install_command
+from companion.wording import counted, lack_of
 from missions.errors import PlanError
 from missions.make.classes import Method
 from missions.make.cleaning import STEPS, Step
@@ -186,10 +186,8 @@ def zones(
     Exit 0: made; 1: made, and the check of the map found errors; 2: refused.
     """
     if importlib.util.find_spec("scipy") is None:
-        raise map_error(
-            data[0], "making zones needs the library scipy, which is not installed",
-            fix=f"install it with: {install_command('office')}", code="missing-library",
-        )  # fmt: skip
+        text, fix = lack_of("scipy")
+        raise map_error(data[0], text, fix=fix, code="missing-library")
     config = bounded(load(config_file, overrides=overrides or ()), boundary)
     wish = _wish(rates, law, litres_max, count, method, smooth_m, step_percent)
     if as_is and is_flight_map(out):

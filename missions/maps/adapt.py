@@ -22,7 +22,7 @@ from typing import Any
 from pyproj import CRS
 
 from companion.errors import MapError
-from companion.wording import install_command
+from companion.wording import lack_of
 from missions.maps.bundle import Bundle, files_beside, one_of, open_bundle
 from missions.maps.crs import WGS84, parse_crs
 from missions.maps.geopackage_layers import CurvedError, Found, areas_of, polygons_in
@@ -435,12 +435,8 @@ def read_table(content: bytes, path: Path, *, geometry_of: Callable[[bytes | Non
         import pyarrow
         import pyarrow.parquet
     except ImportError:
-        raise map_error(
-            path,
-            "reading GeoParquet needs the library pyarrow, which is not installed",
-            fix=f"install it with: {install_command('office')}",
-            code="missing-library",
-        ) from None
+        text, fix = lack_of("pyarrow")
+        raise map_error(path, text, fix=fix, code="missing-library") from None
     broken = (
         pyarrow.ArrowException, OSError, ValueError, TypeError, KeyError, OverflowError,
         MemoryError, NotImplementedError,

@@ -18,7 +18,7 @@ from typing import Any
 from pyproj import CRS
 
 from companion.errors import MapError
-from companion.wording import install_command
+from companion.wording import lack_of
 from missions.maps.bundle import parse_xml
 from missions.maps.crs import parse_crs
 from missions.maps.geotiff_bands import RawBand, ReadBand, read_band
@@ -63,12 +63,8 @@ def gdal(path: Path) -> Any:
         import rasterio
         import rasterio.io
     except ImportError:
-        raise map_error(
-            path,
-            "reading and writing GeoTIFF needs the library rasterio, which is not installed",
-            fix=f"install it with: {install_command('office')}",
-            code="missing-library",
-        ) from None
+        text, fix = lack_of("rasterio")
+        raise map_error(path, text, fix=fix, code="missing-library") from None
     return rasterio
 
 

@@ -18,7 +18,7 @@ from shapely.errors import ShapelyError
 
 from companion.core.frame import LocalFrame
 from companion.map_pictures import draw_below
-from companion.wording import install_command
+from companion.wording import lack_of
 from missions.maps.build import frame_for
 from missions.maps.cells import bounds_deg
 from missions.maps.local import project_all
@@ -70,12 +70,8 @@ def draw(map_file: MapFile, out: Path, *, title: str) -> Totals:
             code="unknown-format",
         )
     if importlib.util.find_spec("matplotlib") is None:
-        raise map_error(
-            out,
-            "no picture without matplotlib",
-            fix=f"install it with: {install_command('office')}",
-            code="missing-library",
-        )
+        text, fix = lack_of("matplotlib")
+        raise map_error(out, text, fix=fix, code="missing-library")
     if not map_file.zones and map_file.cells is None:
         raise map_error(
             map_file.path, "there is nothing to draw", fix="name another file", code="no-polygon"

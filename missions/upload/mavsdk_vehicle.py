@@ -13,7 +13,7 @@ from typing import Any
 
 from companion.errors import LinkError
 from companion.link.transport import parse_url
-from companion.wording import install_command
+from companion.wording import missing
 from missions.upload.items import Firmware, WireItem
 from missions.upload.transfer import NotNowError, Progress, RefusedError, Seen, What
 
@@ -60,7 +60,7 @@ async def connected(url: str, *, wait_s: float) -> AsyncIterator[MavsdkVehicle]:
     """
     target = mavsdk_url(url)
     if importlib.util.find_spec("mavsdk") is None:
-        raise LinkError(f"no upload without MAVSDK; {install_command('office')}")
+        raise LinkError(missing("mavsdk"))
     from mavsdk import asyncio as mavsdk
     from mavsdk.exceptions import MavsdkError
     from mavsdk.logging import log_subscribe

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from companion.atomic_write import write_atomically
 from companion.errors import ConfigError
-from companion.wording import install_command
+from companion.wording import missing
 from sitl.campaign.bundle import Bundle, code_sha256, versions
 from sitl.campaign.design import Campaign, read_campaign
 from sitl.campaign.flying import BY_RATE, BY_RATE_COUNTS, figure_types
@@ -64,7 +64,7 @@ def arrow() -> Any:
         import pyarrow
         import pyarrow.parquet
     except ImportError as error:
-        raise ConfigError(f"campaigns need pyarrow; {install_command('campaign')}") from error
+        raise ConfigError(missing("pyarrow", "campaign")) from error
     return pyarrow
 
 

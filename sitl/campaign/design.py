@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from companion.config import load
 from companion.errors import ConfigError
-from companion.wording import install_command, say_syntax
+from companion.wording import missing, say_syntax
 from sitl.anyang import EXAMPLE
 from sitl.campaign.settings import (
     NOT_IN_CONDITIONS,
@@ -163,10 +163,7 @@ def _points(campaign: Campaign) -> NDArray[np.float64]:
             return np.asarray(drawn, dtype=np.float64)
         return _for_sensitivity(campaign)
     except ImportError as error:
-        raise ConfigError(
-            f"{campaign.path}: design.kind = '{campaign.kind}' needs {error.name}; "
-            f"{install_command('campaign')}"
-        ) from error
+        raise ConfigError(f"{campaign.path}: {missing(str(error.name), 'campaign')}") from error
 
 
 def problem_of(campaign: Campaign) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from companion.errors import ConfigError
-from companion.wording import install_command
+from companion.wording import missing
 from sitl.campaign.show import CONFIDENCE, Floats, Group, Index, Rows, shown_value
 
 if TYPE_CHECKING:
@@ -37,9 +37,7 @@ def draw_pictures(
 
         from sitl.demo_pictures import DPI, STYLE
     except ImportError as error:
-        raise ConfigError(
-            f"no pictures without matplotlib; {install_command('campaign')}"
-        ) from error
+        raise ConfigError(missing("matplotlib", "campaign")) from error
     with rc_context(STYLE):
         drawn = {
             RESPONSES: _responses(rows, groups),

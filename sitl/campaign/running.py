@@ -34,7 +34,7 @@ from time import process_time
 from typing import Any, Protocol, Self, TypeVar, cast
 
 from companion.errors import VrsprayError
-from companion.wording import install_command
+from companion.wording import missing
 from sitl.anyang import EXAMPLE
 from sitl.campaign.bundle import Bundle, code_sha256, folder_of, keep, unpack
 from sitl.campaign.dataset import Dataset
@@ -198,9 +198,7 @@ def cluster_at(address: str) -> Iterator[Cluster]:
         from distributed import Client
         from distributed import TimeoutError as NobodyError
     except ImportError as error:
-        raise VrsprayError(
-            f"--cluster {address}: Dask is missing; {install_command('cluster')}"
-        ) from error
+        raise VrsprayError(f"--cluster {address}: {missing('distributed', 'cluster')}") from error
     nobody = VrsprayError(
         f"--cluster {address}: no Dask scheduler answers; start one with "
         "`dask scheduler --host 127.0.0.1` and give the tcp:// address that it prints"

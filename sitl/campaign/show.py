@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from companion.atomic_write import write_atomically
 from companion.csv_table import csv_of
 from companion.errors import ConfigError
-from companion.wording import install_command
+from companion.wording import missing
 from sitl.campaign.dataset import COPY, arrow, parquet_of, read_columns, read_manifest
 from sitl.campaign.design import (
     GRID,
@@ -487,7 +487,7 @@ def sensitivity_of(rows: Rows) -> list[Index]:
     try:
         import SALib  # noqa: F401
     except ImportError as error:
-        raise ConfigError(f"sensitivity needs SALib; {install_command('campaign')}") from error
+        raise ConfigError(missing("SALib", "campaign")) from error
     found = []
     size, has_interval = len(campaign.points), _has_interval(rows)
     for number, (case, _) in enumerate(campaign.cases):

@@ -278,7 +278,7 @@ def test_number_that_a_command_returns_is_its_exit_code(monkeypatch: pytest.Monk
 
 
 def test_command_that_is_not_installed_says_so() -> None:
-    with pytest.raises(VrsprayError, match="no_such_package is not part of this installation"):
+    with pytest.raises(VrsprayError, match="no_such_package is not installed; add it: "):
         load_command("fly", Command(target="no_such_package:fly", help="Fly."))
 
 

@@ -100,7 +100,7 @@ def test_commands_of_others_are_listed_with_their_help(installed: Path) -> None:
 
 
 def test_what_cannot_be_loaded_is_one_line(installed: Path) -> None:
-    for name, text in (("broken", "cannot be loaded"), ("slow", "slow_to_import is not part")):
+    for name, text in (("broken", "cannot be loaded"), ("slow", "slow_to_import is not installed")):
         done = vrspray(installed, name)
         assert done.returncode == 2
         assert text in done.stderr
@@ -167,7 +167,7 @@ def test_a_vehicle_without_the_office_flies_a_compiled_map(vehicle: Path, tmp_pa
     listed = vrspray(vehicle, "flights", "list", "--folder", str(tmp_path / "flights"))
     assert "flight-0001.gpkg" in listed.stdout
     absent = vrspray(vehicle, "flights", "show", json.loads(flown.stdout)["journal"])
-    assert "is not part of this installation" in absent.stderr
+    assert "is not installed; add it: " in absent.stderr
     shown = vrspray(tmp_path, "flights", "show", json.loads(flown.stdout)["journal"])
     assert f"flight map: {flight_map.sha256[:8]} of prescription.shp, compiled " in shown.stdout
 
@@ -195,4 +195,4 @@ def test_a_vehicle_without_the_office_has_its_own_commands(vehicle: Path) -> Non
     assert "  run " in listed
     done = vrspray(vehicle, "plan", "field.geojson")
     assert done.returncode == 2
-    assert "is not part of this installation" in done.stderr
+    assert "is not installed; add it: " in done.stderr

@@ -48,7 +48,7 @@ def test_without_the_libraries_the_command_that_adds_them_is_said(config: Path) 
     )
     done = subprocess.run([sys.executable, "-c", hidden], capture_output=True, text=True)
     assert done.returncode == 2
-    assert "web.enabled: the Python package fastapi is missing" in done.stderr
+    assert "web.enabled: the library fastapi is not installed" in done.stderr
     assert "vrspray[vehicle]" in done.stderr
     assert "Traceback" not in done.stderr
 

@@ -480,7 +480,7 @@ def test_without_scipy_the_extra_is_named(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
-    with pytest.raises(VrsprayError, match="scipy, which is not installed; install it with"):
+    with pytest.raises(VrsprayError, match="scipy is not installed; add it: "):
         run(data / "soil.csv", "--config", data / "config.toml", "--rates", "9,12", "--out",
             tmp_path / "a.shp")  # fmt: skip
 

@@ -144,7 +144,7 @@ def test_without_pyulog_a_line_says_how_to_get_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyulog", None)
-    with pytest.raises(ConfigError, match=r"reading it needs pyulog; .*vrspray\[office\]"):
+    with pytest.raises(ConfigError, match=r"pyulog is not installed; .*vrspray\[office\]"):
         read_flight(flown_logs.ulog(tmp_path / "a.ulg"))
 
 

@@ -19,6 +19,7 @@ from analysis.replay import replay
 from companion.cli.app import execute
 from companion.core.prescription import Prescription
 from companion.errors import ConfigError
+from companion.wording import missing
 from sitl.anyang import anyang_route, demo_lags, demo_route, demo_setup, demo_trajectory
 from sitl.demo import (
     CALIBRATED,
@@ -362,7 +363,7 @@ def test_without_matplotlib_there_is_all_but_the_pictures(
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err.splitlines() == [
-        "no pictures: matplotlib is missing; pip install 'vrspray[office]'",
-        "no report of the flight: jinja2 or matplotlib is missing; pip install 'vrspray[office]'",
+        f"no pictures: {missing('matplotlib')}",
+        f"no report of the flight: {missing('jinja2 or matplotlib')}",
     ]
     assert "scheduled" in (tmp_path / "report.html").read_text()

@@ -19,7 +19,7 @@ from typing import Any, Protocol
 
 from companion.errors import ActuatorError, VrsprayError
 from companion.output.engine.wire import EngineSetup
-from companion.wording import install_command
+from companion.wording import install_command, missing
 
 
 class Lines(Protocol):
@@ -133,13 +133,11 @@ def load_gpiod(error_type: type[VrsprayError] = ActuatorError) -> Any:
     try:
         gpiod = importlib.import_module("gpiod")
     except ImportError as error:
-        raise error_type(
-            f"the Python package gpiod is missing: {install_command('vehicle')}"
-        ) from error
+        raise error_type(missing("gpiod", "vehicle")) from error
     version = str(getattr(gpiod, "__version__", "1"))
     if not version.partition(".")[0].isdigit() or int(version.partition(".")[0]) < 2:
         # Debian 12's own package is version 1 under the same name, with another interface.
-        raise error_type(f"gpiod {version} is too old: {install_command('vehicle')}")
+        raise error_type(f"gpiod {version} is too old; add it: {install_command('vehicle')}")
     return gpiod
 
 
