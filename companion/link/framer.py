@@ -25,6 +25,8 @@ _SIGNATURE = 13
 # A frame on the slowest usable wire (57600 baud) is through in 49 ms; a start that is still
 # incomplete after this was none, and must not hold back what follows.
 STALE_S = 0.25
+# With so many starts in a chunk that were none, only senders that were heard before are looked at.
+_FALSE_MAX, _HEARD_MAX = 64, 256
 
 _EXTRA = {number: bytes([one.crc_extra]) for number, one in mavlink.mavlink_map.items()}
 
@@ -75,6 +77,7 @@ class Framer:
         self.may_split = True
         self._held = b""
         self._oldest_s = 0.0
+        self._heard: set[bytes] = set()
 
     def push(self, data: bytes, received_s: float) -> list[bytes]:
         """Return the sound frames that are complete with `data`; never raises."""
@@ -82,11 +85,14 @@ class Framer:
         joint = len(self._held) - is_stale
         held = self._held[is_stale:] + data
         frames: list[bytes] = []
-        at, size, edge = 0, len(held), None
+        at, size, edge, false = 0, len(held), None, 0
         kept = size
         for found in _START.finditer(held):
             start = found.start()
             if start < at:
+                continue
+            if false > _FALSE_MAX and _sender(held, start) not in self._heard:
+                self.counts.excess_frames += 1
                 continue
             end, is_sound = _look(held, start)
             if end > size:
@@ -97,8 +103,11 @@ class Framer:
             elif is_sound:
                 frames.append(held[start:end])
                 at = end
+                if len(self._heard) < _HEARD_MAX:
+                    self._heard.add(_sender(held, start))
             else:
-                self.counts.bad_frames += 1
+                false += 1
+        self.counts.bad_frames += false
         self._held = held[kept:] if self.may_split else b""
         self.counts.dropped_bytes += is_stale + len(held) - len(self._held) - sum(map(len, frames))
         if frames or not len(self._held) > len(data):
@@ -146,6 +155,12 @@ def _message_id(frame: bytes, at: int = 0) -> int:
     if frame[at] == _V1:
         return frame[at + 5]
     return int.from_bytes(frame[at + 7 : at + 10], "little")
+
+
+def _sender(held: bytes, at: int) -> bytes:
+    """Return system and component of a frame that begins at `at`."""
+    at += 3 if held[at] == _V1 else 5
+    return held[at : at + 2]
 
 
 def _look(held: bytes, at: int) -> tuple[int, bool]:

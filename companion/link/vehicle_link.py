@@ -339,6 +339,8 @@ def _nothing() -> None:
 # Watches a link that is up, and says in one line what is wrong with it.
 
 _LOOK_S = 0.5
+# A sender who is over his share by so much between two looks, in bytes or in frames, is a flood.
+_FLOOD_BYTES, _FLOOD_FRAMES = 4096, 50
 
 
 class Watch:
@@ -353,6 +355,7 @@ class Watch:
         self._up_s: float | None = None
         self._looked_s = float("-inf")
         self._before = (0, 0, 0)
+        self._excess = (0, 0)
         self._is_met = False
         self._is_twin_told = False
 
@@ -390,7 +393,22 @@ class Watch:
             asked_s=None if component.is_answered or met_s is None else now_s - met_s,
             now_s=now_s,
         )
-        return find(self._parsed(), component.codec.census, seen)
+        flood = self._flood()
+        return find(self._parsed(), component.codec.census, seen) or flood
+
+    def _flood(self) -> Finding | None:
+        """Return that somebody sends more than is read; what is within its share is."""
+        counts, before = self._component.codec.counts, self._excess
+        self._excess = (counts.excess_bytes, counts.excess_frames)
+        more_bytes, more_frames = (now - old for now, old in zip(self._excess, before, strict=True))
+        if more_bytes < _FLOOD_BYTES and more_frames < _FLOOD_FRAMES:
+            return None
+        return Finding(
+            text=f"{self._url_text}: somebody sends more than is read ({counts.excess_bytes} B and "
+            f"{counts.excess_frames} frames dropped so far); the vehicle's messages are read: find "
+            "the sender, or close the port to it",
+            short="link: a flood of messages is dropped",
+        )
 
     def _parsed(self) -> LinkUrl:
         if self._url is None:

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import hashlib
 import itertools
+import logging
 import os
 import socket
 from collections.abc import AsyncIterator, Iterator
@@ -19,7 +20,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.core.types import OperatorCommand, Telemetry
 from companion.link import signing as signing_module
 from companion.link.component import Component, ComponentOptions
-from companion.link.framer import Counts
+from companion.link.framer import Counts, Framer
 from companion.link.intake import (
     CHUNK_BYTES_MIN,
     KNOWN_BYTES,
@@ -93,6 +94,42 @@ async def test_a_strangers_flood_is_dropped_and_counted_and_no_position_is_lost(
         assert work["checksum"] == 21
         line = bench.link.component.meter.read(codec, bench.now_s).line()
         assert "not read 1310140 B, 0 frames" in line
+
+
+async def test_a_flood_is_told_in_one_line_and_again_a_minute_later(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.WARNING)
+    async with linked(f"udpin:127.0.0.1:{free_port()}") as bench:
+        link = bench.link
+        link.component.receive(heartbeat(), bench.now_s)
+        link.component.is_answered = True
+        for turn in range(620):
+            if turn % 10 == 0:
+                link.component.receive(heartbeat(), bench.now_s)
+            for stranger in range(3):
+                link._intake.put(FLOOD, bench.now_s, ("192.0.2.1", stranger), is_known=False)
+            bench.pass_time(0.1)
+        told = [text for text in bench.said(caplog) if "more than is read" in text]
+        assert len(told) == 2
+        assert [text for text in bench.events if "more than is read" in text] == told
+        # It is over, and is no news a second later.
+        bench.events.clear()
+        bench.pass_time(1.0)
+        assert not any("more than is read" in text for text in bench.events)
+
+
+def test_behind_many_false_starts_whoever_was_heard_before_is_read() -> None:
+    framer, other = Framer(), mavlink.MAVLink(None, srcSystem=9, srcComponent=190)
+    new = bytes(other.heartbeat_encode(6, 8, 0, 0, 4).pack(other))
+    heads = b"\xfe\x18" * 1000
+    assert framer.push(position(1), 1.0) == [position(1)]
+    with counted() as work:
+        assert framer.push(heads + new + position(2), 2.0) == [position(2)]
+    assert work["checksum"] <= 80
+    assert framer.counts.excess_frames > 900
+    assert framer.push(new, 3.0) == [new]
+    assert framer.push(heads + new, 4.0) == [new]
 
 
 async def test_what_waits_behind_the_datagrams_of_others_is_read_in_the_same_turn() -> None:
