@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
+import numpy as np
+
 from companion.config import Config
 from companion.config.rules import mismatches, tank_capacity_l
 from companion.config.tables import PrescriptionTable
@@ -40,6 +42,8 @@ from companion.wording import show_value
 # a second that is a quarter of the flow, from one bin to the next.
 AUTOPILOT_BIN_S = 0.55
 AUTOPILOT_UNSTEADY_SHARE = 0.25
+# How close places on planned lines are looked at, for a rate.
+LINE_STEP_M = 1.0
 # More rates than these are named by their range: the line must stay readable.
 RATES_NAMED_MAX = 6
 
@@ -116,7 +120,7 @@ def build_setup(config: Config, flight_map: FlightMap) -> Setup:
     check_mark(config, table)
     prescription = flight_map.moved(table.offset_east_m, table.offset_north_m)
     pump, atomisers = _motors(config)
-    return Setup(
+    setup = Setup(
         frame=flight_map.frame,
         prescription=prescription,
         boom=config.boom(),
@@ -147,6 +151,35 @@ def build_setup(config: Config, flight_map: FlightMap) -> Setup:
         record_coverage=config.coverage.record and config.output.kind != "none",
         overlap=_overlap(config),
         most_m_s2=MOST_M_S2 if config.mission is None else config.mission.acceleration_m_s2,
+    )
+    why = sprays_nothing(setup)
+    if why is not None:
+        raise ConfigError(
+            f"{config.path}: can open no valve on this map, because {why[0]}; {why[1]}"
+        )
+    return setup
+
+
+def sprays_nothing(setup: Setup) -> tuple[str, str] | None:
+    """Return why no flight over the map can open a valve, and what to do; None where one can."""
+    prescription, lines = setup.prescription, setup.lines
+    rates = [*prescription.rates_l_ha, prescription.default_rate_l_ha or 0.0]
+    if not max(rates) > 0.0:
+        return "every rate is 0", "check the rate column (vrspray map check)"
+    if lines is None:
+        return None
+    # Where the middles of the strips come by; a zone smaller than a step is not worth a flight.
+    for piece in lines.pieces:
+        along = np.arange(0.0, piece.length_m + LINE_STEP_M, LINE_STEP_M)[:, None]
+        right = np.array([valve.right_m for valve in setup.boom.valves])
+        for side in (right, -right):  # flown either way
+            east = piece.east_m + along * piece.unit_east + side * piece.unit_north
+            north = piece.north_m + along * piece.unit_north - side * piece.unit_east
+            if (prescription.rates_at(east.ravel(), north.ravel()) > 0.0).any():
+                return None
+    return (
+        "no line of mission.lines lies over ground with a rate",
+        "plan this map's field again, or leave mission.lines out",
     )
 
 

@@ -15,7 +15,7 @@ from analysis.calibration.steps import settle_s
 from companion.config import Config, load
 from companion.core.frame import LocalFrame
 from companion.core.nozzle import SET_UP_FRACTION, rate_for_flow, set_change_l_min
-from companion.errors import ConfigError
+from companion.errors import ConfigError, VrsprayError
 from companion.map_formats import geojson_feature, geojson_text
 from missions.files.items import Autopilot, Item
 from missions.files.write import plan_content, plan_json, rows_text
@@ -151,14 +151,18 @@ def write_calibration(
     copy = out.with_name(f"{out.stem}-config.toml")
     if copy.resolve() == config_path.resolve():
         raise ConfigError(f"--out {out}: {copy} is the configuration itself; take another name")
-    _write(prescription, _map_text(layout, turned))
-    _write(copy, _with_map(config.source_text, prescription.name))
     items = _items(layout, turned)
     autopilot = config.mission.autopilot if config.mission else "ardupilot"
-    _write(
-        out, plan_of(items, autopilot=autopilot) if out.suffix == ".plan" else waypoints_of(items)
-    )
-    compiled_setup(load(copy))  # refuses what could not be flown, such as a product's label
+    is_plan = out.suffix == ".plan"
+    _write(prescription, _map_text(layout, turned))
+    _write(copy, _with_map(config.source_text, prescription.name))
+    _write(out, plan_of(items, autopilot=autopilot) if is_plan else waypoints_of(items))
+    try:
+        compiled_setup(load(copy))
+    except VrsprayError:  # nobody flies what would spray nothing
+        for path in (prescription, copy, out):
+            path.unlink()
+        raise
     return Written(mission=out, prescription=prescription, config=copy, layout=layout)
 
 
@@ -253,17 +257,23 @@ def _items(layout: Layout, turned: _Turned) -> tuple[MissionItem, ...]:
     )
 
 
+# What a configuration says of its field and of what is sprayed there: here it is water.
+OF_A_FIELD = ("prescription", "coverage", "limits", "tank", "application", "product", "mix")
+LINES = "mission.lines"
+
+
 def _with_map(text: str, file: str) -> str:
-    """Return a configuration's text with another map, and nothing else of its prescription."""
-    kept, is_dropped = [], False
+    """Return a configuration's text with another map, and nothing that belongs to its own field."""
+    kept, table = [], ""
     for line in text.splitlines():
-        header = re.match(r"\s*\[+\s*([A-Za-z0-9_.-]+)", line)
-        if header is not None:
-            is_dropped = header[1].split(".")[0] == "prescription"
-        if not is_dropped:
+        if header := re.match(r"\s*\[{1,2}\s*([A-Za-z][\w.-]*)\s*\]", line):
+            table = f"{header[1]}."
+        key = re.match(r"\s*([\w.-]+)\s*=", line)
+        name = table + (key[1] if key else "")
+        if name.partition(".")[0] not in OF_A_FIELD and name != LINES:
             kept.append(line)
-    table = f'[prescription]\nfile = {json.dumps(file)}\nrate_field = "rate"\n'
-    return "\n".join([*kept, "", table])
+    named = f'[prescription]\nfile = {json.dumps(file)}\nrate_field = "rate"\n'
+    return "\n".join([*kept, "", named])
 
 
 def _write(path: Path, text: str) -> None:

@@ -50,6 +50,7 @@ from missions.make.flown import (
     OutFile,
     Picture,
     bounded,
+    check_rate,
     draw_picture,
     flown_field,
     limits_of,
@@ -211,6 +212,9 @@ def zones(
         read = [read_values(path, one, field.frame) for path, one in zip(data, wanted, strict=True)]
         points = _points_of(read, data) if cleaned is not None else None
         limits = None if as_is else limits_of(config, field.sprayer, margin)
+        for rate in wish.rates_l_ha:
+            if limits is not None and rate > 0.0:
+                check_rate(rate, limits, said=f"--rates {rate:g}")
         places = _places(
             field, read, limits or limits_of(config, field.sprayer, margin), as_is, out
         )
@@ -397,6 +401,7 @@ def _result(
         "least_m": None if limits is None else limits.least_m,
         "rates_min_l_ha": None if limits is None else limits.low_l_ha,
         "rates_max_l_ha": None if limits is None else limits.high_l_ha,
+        "became": [{"asked_l_ha": asked, "rate_l_ha": rate} for asked, rate in made.became],
         "zones": [
             {"rate_l_ha": rate, "mean_value": mean, "area_ha": area_ha}
             for rate, mean, area_ha in zip(
@@ -417,6 +422,9 @@ def _result(
 
 def _lines(result: dict[str, Any], made: Made, read: Sequence[Values]) -> list[str]:
     lines = []
+    if made.became:
+        shown = ", ".join(f"{asked:.4g} became {rate:g}" for asked, rate in made.became)
+        lines.append(f"rates are not those asked for [L/ha]: {shown}")
     for one in read:
         removed = {name: count for name, count in (one.removed or {}).items() if count}
         if one.count is not None:

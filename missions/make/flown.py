@@ -7,7 +7,7 @@ sprayer can follow on them, the checks of `map check`, and files, a flight map a
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -198,11 +198,13 @@ def written(
     return [out, *files]
 
 
-def draw_picture(map_file: MapFile, path: Path, *, title: str) -> None:
-    """Draw the map that was made."""
+def draw_picture(
+    map_file: MapFile, path: Path, *, title: str, names: Mapping[str, str] | None = None
+) -> None:
+    """Draw the map that was made, with names on its zones."""
     from missions.maps.picture import draw  # matplotlib, which not everybody has
 
-    draw(map_file, path, title=title)
+    draw(map_file, path, title=title, names=names)
 
 
 def check_rate(rate_l_ha: float, limits: Limits, *, said: str) -> None:

@@ -203,6 +203,7 @@ def spots(
     if png is not None:
         draw_picture(map_file, png, title=out.name)
     ground_m2 = field.turned().area
+    is_exposed = chances > budget.miss_share + 1e-9
     result: dict[str, Any] = {
         "ok": not any(problem.severity == "error" for problem in problems),
         "files": [str(path) for path in files],
@@ -228,7 +229,8 @@ def spots(
         "litres": treated.area / 1e4 * rate,
         "saved_litres": (ground_m2 - treated.area) / 1e4 * rate,
         "saved_percent": 100.0 * (1.0 - treated.area / ground_m2),
-        "exposed": int((chances > budget.miss_share + 1e-9).sum()),
+        "exposed": int(is_exposed.sum()),
+        "exposed_misses": float(chances[is_exposed].sum()),
         "expected_misses": float(chances.sum()),
         "expected_misses_percent": 100.0 * float(chances.mean()),
         "route": best,
@@ -417,25 +419,34 @@ def _lines(result: dict[str, Any]) -> list[str]:
     ]
     lines += [
         f"  {'around each weed':26} {budget['along_m']:6.2f}  {budget['across_m']:6.2f}"
-        f"  so that at most {budget['miss_percent']:g} % are missed; whole valves across",
+        "  whole valves across",
         f"gaps below {result['gap_min_m']:.2f} m stay open, openings last "
         f"{result['least_m']:.2f} m",
         f"{counted(result['spots'], 'spot')}, {result['treated_ha']:.4f} ha or "
         f"{result['treated_percent']:.1f} % of the field, {result['litres']:.2f} L; saved: "
         f"{result['saved_litres']:.2f} L, {result['saved_percent']:.1f} %",
-        f"misses to expect: {result['expected_misses']:.2f} weeds, "
-        f"{result['expected_misses_percent']:.2f} %",
+        _misses(result),
         *(
             f"{name}: {seconds / 60.0:.1f} min of flight"
             + ("  <- quickest" if name == result["route"] else "")
             for name, seconds in result["flight_s"].items()
         ),
     ]
-    if result["exposed"]:
-        lines.append(
-            f"{counted(result['exposed'], 'weed')} of them close to ground that is not sprayed: "
-            "position errors are more likely to miss there"
-        )
     if result["beyond"]:
         lines.append(f"{counted(result['beyond'], 'weed')} outside of the field left out")
     return [*lines, *(f"written: {name}" for name in result["files"])]
+
+
+def _misses(result: dict[str, Any]) -> str:
+    """Return how many weeds will be missed, and why more than asked for."""
+    of_all, weeds, exposed = result["expected_misses"], result["weeds"], result["exposed"]
+    line = f"misses to expect: {of_all:.2f} of {counted(weeds, 'weed')}"
+    line += f", {result['expected_misses_percent']:.2f} %"
+    if not exposed:
+        return line
+    near = result["exposed_misses"]
+    others = f"{of_all - near:.2f} of the others" if weeds > exposed else "no others"
+    return (
+        f"{line}: {near:.2f} of {counted(exposed, 'weed')} close to ground that is not sprayed, "
+        f"where {result['budget']['miss_percent']:g} % cannot be kept, and {others}"
+    )

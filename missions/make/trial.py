@@ -299,7 +299,12 @@ def trial(
     except OSError as error:
         raise not_written(record, error) from None
     if png is not None:
-        draw_picture(map_file, png, title=out.name)
+        names = {
+            f"plot {plot.number}": f"{plot.number}, block {plot.block}: "
+            f"{treatments[plot.treatment]:g} L/ha"
+            for plot in plots
+        }
+        draw_picture(map_file, png, title=out.name, names=names)
     ok = not any(problem.severity == "error" for problem in problems)
     result = {
         "ok": ok,

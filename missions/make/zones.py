@@ -191,10 +191,12 @@ class Step:
 class Made:
     """Zones, and what became of the data on the way to them.
 
-    `bands` has the zone of every step along every pass, NONE outside of the field.
+    `bands` has the zone of every step along every pass, NONE outside of the field. `became` has
+    the rates that were asked for and are not what they became.
     """
 
     rates_l_ha: tuple[float, ...]
+    became: tuple[tuple[float, float], ...]
     breaks: tuple[float, ...]
     means: tuple[float, ...]
     areas_ha: tuple[float, ...]
@@ -225,7 +227,7 @@ def make_zones(layers: Floats, places: Places, wish: Wish, limits: Limits | None
     count = int(classes.labels.max()) + 1
     means = work.means(layers[0], classes.labels, count)
     ideal, rates = _ideal(layers[0], classes.labels, means, wish, work)
-    scale = _scale(work, ideal, wish.litres_max)
+    asked, scale = rates, _scale(work, ideal, wish.litres_max)
     ideal, rates = ideal * scale, rates * scale
     if not work.litres(ideal) > 0.0:
         raise PlanError("all rates are zero: nothing would be sprayed; give others with --rates")
@@ -241,6 +243,7 @@ def make_zones(layers: Floats, places: Places, wish: Wish, limits: Limits | None
         labels = _majority(labels, places, count, wish.smooth_m)
         work.step("smoothing", rates[labels])
         target = rates[labels]
+    classes_left, places_of = np.unique(labels, return_index=True)
     if limits is not None:
         rates, labels, means = _delivered(work, rates, labels, means, wish, limits)
     every, bands, step_m = work.along(labels, rates, target)
@@ -251,9 +254,11 @@ def make_zones(layers: Floats, places: Places, wish: Wish, limits: Limits | None
     work.step("rounding", rounded(rates, limits)[every])
     rates = rounded(rates, limits)
     final = rates[every]
+    pairs = zip(asked[classes_left].tolist(), rates[labels[places_of]].tolist(), strict=True)
     areas_m2 = work.ground_m2(every, len(rates))
     return Made(
         rates_l_ha=tuple(rates.tolist()),
+        became=tuple(pair for pair in pairs if abs(pair[0] - pair[1]) > 10.0**-DECIMALS),
         breaks=classes.breaks,
         means=tuple(means.tolist()),
         areas_ha=tuple((areas_m2 / 1e4).tolist()),
@@ -311,7 +316,7 @@ class _Work:
                 changed_ha=float(self.area_m2[change > 1e-9].sum()) / 1e4,
                 moved_l=moved_l,
                 litres=self.litres(rates),
-                variance_kept_percent=100.0 * kept,
+                variance_kept_percent=100.0 * max(kept, 0.0),
             )
         )
 

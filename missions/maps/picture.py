@@ -7,6 +7,7 @@ what would be sprayed: the default rate as ground of its own, nothing beyond the
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -59,8 +60,13 @@ class Sheet(NamedTuple):
         return (self.ground_m[2] - self.ground_m[0]) / self.map_in[0]
 
 
-def draw(map_file: MapFile, out: Path, *, title: str) -> Totals:
-    """Draw a map into a PNG, SVG or PDF file and return the ground of each rate."""
+def draw(
+    map_file: MapFile, out: Path, *, title: str, names: Mapping[str, str] | None = None
+) -> Totals:
+    """Draw a map into a PNG, SVG or PDF file and return the ground of each rate.
+
+    `names` are written on zones, by what these are called in the map.
+    """
     suffix = out.suffix.casefold()
     if suffix not in SUFFIXES:
         raise map_error(
@@ -77,14 +83,16 @@ def draw(map_file: MapFile, out: Path, *, title: str) -> Totals:
             map_file.path, "there is nothing to draw", fix="name another file", code="no-polygon"
         )
     try:
-        content, found = _drawn(map_file, title, suffix)
+        content, found = _drawn(map_file, title, suffix, names or {})
     except ShapelyError as error:
         raise unusable_polygons(map_file.path, error) from None
     write_whole(out, content)
     return found
 
 
-def _drawn(map_file: MapFile, title: str, suffix: str) -> tuple[bytes, Totals]:
+def _drawn(
+    map_file: MapFile, title: str, suffix: str, names: Mapping[str, str]
+) -> tuple[bytes, Totals]:
     """Return the picture's bytes, and the ground of each rate."""
     from matplotlib import rc_context
 
@@ -93,6 +101,7 @@ def _drawn(map_file: MapFile, title: str, suffix: str) -> tuple[bytes, Totals]:
     found = totals(map_file, frame=frame)
     with rc_context(STYLE | {"hatch.linewidth": 0.6}):
         figure = _figure(sprayed, frame, found, title)
+        _write_names(figure, sprayed, frame, names)
         return content_of(figure, suffix, dpi=DPI), found
 
 
@@ -140,6 +149,28 @@ def _figure(map_file: MapFile, frame: LocalFrame, found: Totals, title: str) -> 
         boundary=map_file.boundary is not None,
     )
     return figure
+
+
+def _write_names(
+    figure: Figure, map_file: MapFile, frame: LocalFrame, names: Mapping[str, str]
+) -> None:
+    """Write a name along each zone that has one, as large as it has room."""
+    axes = figure.axes[0]
+    point_m = np.ptp(axes.get_xlim()) / (axes.get_position().width * figure.get_figwidth() * 72.0)
+    box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.3}
+    for zone in map_file.zones:
+        if (text := names.get(zone.name)) is None:
+            continue
+        (area,) = project_all(np.array([zone.geometry], dtype=object), frame)
+        sides = np.diff(shapely.get_coordinates(shapely.oriented_envelope(area))[:3], axis=0)
+        across, along = sorted(sides, key=lambda side: float(np.hypot(*side)))
+        room_m = min(0.75 * np.hypot(*across), np.hypot(*along) / (0.65 * len(text)))
+        angle_deg = (np.degrees(np.arctan2(along[1], along[0])) + 90.0) % 180.0 - 90.0
+        at = shapely.centroid(area)
+        axes.text(
+            at.x, at.y, text, size=min(room_m / point_m, 12.0), rotation=angle_deg, bbox=box,
+            rotation_mode="anchor", ha="center", va="center",
+        )  # fmt: skip
 
 
 def sheet_for(bounds_m: tuple[float, float, float, float]) -> Sheet:

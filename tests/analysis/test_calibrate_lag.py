@@ -13,10 +13,12 @@ import pytest
 from analysis.calibrate_cli import TooFewStepsError, lag_result, refusal, settings
 from analysis.calibration.identify import identify, jackknife, mean_of
 from analysis.calibration.steps import FlowRecord, Kind, Reject, find_steps, is_trim, record_of
+from analysis.evaluation import evaluate
 from companion.cli.app import execute
 from companion.config import load
 from companion.core.schedule import LagModel
 from companion.core.types import Decision, FlowReport, SprayPlan, TimedChange
+from companion.errors import ConfigError
 from companion.journal.journal import Journal
 from missions.maps.compiling import compiled_setup
 from sitl.anyang import demo_setup
@@ -314,6 +316,57 @@ def test_a_mission_that_cannot_be_made_is_refused_in_one_line(
     error = capsys.readouterr().err
     assert text in error
     assert error.count("\n") == 1
+
+
+def of_a_field(folder: Path) -> Path:
+    """A configuration as after a season: lines of a plan, coverage, exclusions, limits, a tank."""
+    # Across the first strip of a flight that begins at 48.1, 11.5, where nothing is sprayed.
+    line = {"type": "LineString", "coordinates": [[11.49996, 48.10002], [11.50004, 48.10002]]}
+    feature = {"type": "Feature", "geometry": line, "properties": {"kind": "spray"}}
+    text = json.dumps({"type": "FeatureCollection", "features": [feature]})
+    (folder / "field.lines.geojson").write_text(text)
+    (folder / "limits.toml").write_text(
+        'version = 1\ntitle = "permit"\nrate_max_l_ha = 1.0\nhours = ["00:00-00:01"]\n'
+        'utc_offset = "+00:00"\n'
+    )
+    path = folder / "season.toml"
+    path.write_text(
+        ANYANG.read_text().replace(
+            "[boom]", '[coverage]\nswitch_off_percent = 50\n\n[limits]\nfile = "limits.toml"\n\n'
+            '[product]\nname = "X"\nrate_max_l_ha = 2.0\n\n[boom]'
+        ).replace("[mission]\n", '[mission]\nlines = "field.lines.geojson"\n', 1)
+    )  # fmt: skip
+    assert "field.lines" in path.read_text()
+    return path
+
+
+def test_a_season_in_the_field_leaves_the_calibration_flight_its_water(tmp_path: Path) -> None:
+    written = write_calibration(of_a_field(tmp_path), tmp_path / "cal.plan", origin=(48.1, 11.5))
+    config = load(written.config)
+    setup = compiled_setup(config)
+    assert config.mission is not None and config.mission.lines is None
+    assert (setup.lines, setup.overlap, config.label, config.rate_max_l_ha()) == (None,) * 4
+    route = read_route(written.mission, setup.frame, speed_m_s=None, default_speed_m_s=5.0)
+    trajectory = Vehicle(replace(route, legs=route.legs[:1]), start_s=0.0, seed=5).fly_to_end()
+    options = FlightOptions(fidelity="averaged", output="servo", seed=5)
+    flown = fly(setup, trajectory, load_profile("wang-2024"), options, speed_m_s=5.0)
+    share = 1.0 / len(written.layout.passes)
+    assert evaluate(flown.record).applied_ml == pytest.approx(
+        1000.0 * share * written.layout.volume_l, rel=0.1
+    )
+
+
+def test_a_calibration_flight_that_would_spray_nothing_is_not_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As it was before: the lines of the field stay, and close every valve."""
+    path = of_a_field(tmp_path)
+    monkeypatch.setattr("sitl.calibration_mission.LINES", "none")
+    with pytest.raises(ConfigError, match="can open no valve on this map, because no line of"):
+        write_calibration(path, tmp_path / "cal.plan", origin=(48.1, 11.5), heading_deg=0.0)
+    assert sorted(each.name for each in tmp_path.iterdir()) == [
+        "field.lines.geojson", "limits.toml", "season.toml",
+    ]  # fmt: skip
 
 
 # --------------------------------------------------------------------------------- on the twin

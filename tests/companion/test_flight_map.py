@@ -577,3 +577,21 @@ def test_a_flight_map_is_named_where_a_journal_is_wanted(
         f"error: {flight_map}: this is a flight map, not a journal; give the .gpkg file of a "
         "flight\n"
     )
+
+
+def test_a_map_on_which_no_valve_can_open_is_refused_before_the_flight(tmp_path: Path) -> None:
+    square = [[8.0, 47.0], [8.001, 47.0], [8.001, 47.001], [8.0, 47.001], [8.0, 47.0]]
+    geometry = {"type": "Polygon", "coordinates": [square]}
+    features = [
+        {"type": "Feature", "geometry": geometry, "properties": {"rate": 0.0, "unit": "L/ha"}}
+    ]
+    (tmp_path / "zero.geojson").write_text(
+        json.dumps({"type": "FeatureCollection", "features": features})
+    )
+    given = [f"prescription.file={tmp_path / 'zero.geojson'}"]
+    path = tmp_path / "config.toml"
+    text = ANYANG.read_text().replace('boundary = "boundary.geojson"\n', "")
+    path.write_text(text)
+    config = load(path, overrides=given)
+    with pytest.raises(ConfigError, match="can open no valve on this map, because every rate is 0"):
+        build_setup(config, flight_map_of(config, given))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +75,19 @@ def local(geometries: Any) -> Any:
     return shapely.transform(
         geometries, lambda at: np.column_stack(there.transform(at[:, 0], at[:, 1]))
     )
+
+
+def test_the_picture_names_every_plot_its_block_and_its_rate(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    picture = tmp_path / "trial.svg"
+    found = made(
+        capsys, data, tmp_path / "trial.gpkg", "--rates", "15,20", "--blocks", "2", "--plot-m",
+        "20", "--angle-deg", "90", "--png", picture,
+    )  # fmt: skip
+    words = [word.strip() for word in re.findall(r"<!-- (.*?) -->", picture.read_text(), re.DOTALL)]
+    for plot in found["plots"]:
+        assert f"{plot['plot']}, block {plot['block']}: {plot['rate_l_ha']:g} L/ha" in words
 
 
 def test_rates_of_the_limits_file_bound_what_is_made(data: Path, tmp_path: Path) -> None:

@@ -195,7 +195,32 @@ def test_every_zone_has_its_rate_and_its_ground() -> None:
     assert made.areas_ha == pytest.approx([0.048] * 3)
     assert made.litres == pytest.approx(0.048 * 60.0)
     assert made.misapplied_l == 0.0
-    assert made.steps == ()
+    assert made.steps == () == made.became
+
+
+def test_what_is_left_of_the_data_is_none_where_every_rate_is_another() -> None:
+    made = square(
+        Limits(least_m=1.0, low_l_ha=33.0, high_l_ha=34.0),
+        Wish(count=3, method="equal", law=((0.0, 250.0), (59.0, 260.0))),
+    )
+    assert made.steps[-1].variance_kept_percent == 0.0
+    assert {rate for _, rate in made.became} == {34.0}
+
+
+def test_rates_that_the_nozzles_do_not_deliver_are_refused_unless_as_is(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "a.gpkg"
+    words = [data / "soil.csv", "--config", data / "config.toml", "--out", out]
+    for rates, wrong in (("5,20", "--rates 5"), ("20,260", "--rates 260")):
+        with pytest.raises(VrsprayError, match=f"{wrong}: nozzles and label allow"):
+            run(*words, "--rates", rates, "--angle-deg", "40")
+    assert not out.exists()
+    assert run(*words, "--rates", "5,20", "--angle-deg", "40", "--as-is") == 0
+    capsys.readouterr()
+    # By a law the ends may lie beyond them; the first line says so.
+    assert run(*words, "--law", "0:5,99:5", "--angle-deg", "40", "--zones", "1", "--force") == 0
+    assert capsys.readouterr().out.startswith("rates are not those asked for [L/ha]: 5 became ")
 
 
 def test_rates_beyond_the_nozzles_are_what_they_deliver_and_the_price_is_told() -> None:
@@ -204,6 +229,7 @@ def test_rates_beyond_the_nozzles_are_what_they_deliver_and_the_price_is_told() 
         Wish(count=3, method="equal", rates_l_ha=(0.0, 10.0, 30.0)),
     )
     assert made.rates_l_ha == (0.0, 12.0, 25.0)
+    assert made.became == ((10.0, 12.0), (30.0, 25.0))
     (step,) = made.steps
     assert (step.name, step.changed_ha) == ("nozzles", pytest.approx(0.096))
     assert step.moved_l == pytest.approx(0.048 * (2.0 + 5.0))
@@ -216,6 +242,7 @@ def test_rates_beyond_the_nozzles_are_what_they_deliver_and_the_price_is_told() 
 def test_rates_too_close_to_be_worth_a_change_become_one() -> None:
     made = square(EASY, Wish(count=3, method="equal", rates_l_ha=(20.0, 21.0, 30.0)))
     assert made.rates_l_ha == (20.5, 30.0)
+    assert made.became == ((20.0, 20.5), (21.0, 20.5))
     assert [step.name for step in made.steps] == ["steps of rate"]
 
 
