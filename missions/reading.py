@@ -16,6 +16,7 @@ from shapely.geometry.base import BaseGeometry
 
 from companion.assembly import above_label, flow_range
 from companion.config import Config
+from companion.config.rules import mismatches
 from companion.config.tables import MissionTable, PrescriptionTable, out_of_bounds
 from companion.core.frame import LocalFrame
 from companion.core.prescription import Prescription
@@ -301,6 +302,7 @@ def _settings(config: Config | None, changes: dict[str, float | int | None]) -> 
         settings = replace(settings, **given)
     except ValueError as error:
         raise PlanError(f"this cannot be flown: {error}") from error
+    _refuse_unsprayed(config, settings, changes)
     if highest is None:
         return settings
     limit = SPEED_MAX_M_S if config is None else config.safety.speed_max_m_s
@@ -311,6 +313,22 @@ def _settings(config: Config | None, changes: dict[str, float | int | None]) -> 
             f"{settings.speed_m_s:g} m/s, and at most {limit:g} m/s{source}"
         )
     return replace(settings, speeds_m_s=(settings.speeds_m_s[0], highest))
+
+
+def _refuse_unsprayed(
+    config: Config | None, settings: Settings, changes: Mapping[str, float | int | None]
+) -> None:
+    """Refuse what `config check` would, were the options of the plan its keys."""
+    if config is None or config.mission is None:
+        return
+    planned = {"swath_width_m": settings.swath_width_m, "speed_m_s": settings.speed_m_s}
+    mission = config.mission.model_copy(update=planned)
+    for found in mismatches(config.model_copy(update={"mission": mission})):
+        name = found.key.removeprefix("mission.")
+        said = f"{config.path}: {found.key}"
+        if changes.get(name) is not None:
+            said = f"--{OPTIONS.get(name, name).replace('_', '-')} {changes[name]:g}"
+        raise PlanError(f"{said}: {found.text}")
 
 
 def assumed(

@@ -29,6 +29,7 @@ ABOUT = {
     "atomiser": "two rotary atomisers fed by one pump",
     "own-method": "controllers of one's own, for --controller",
     "zones": "a made-up field's data by a script, for vrspray make zones",
+    "paper": "a scan of water-sensitive paper, drawn, and where its cards lay on anyang's field",
     "campaigns": "many flights with varied settings, for vrspray campaign",
     "profiles": "wirings of valves on this computer's own lines",
     DEPLOY: "for the vehicle: install script, ArduPilot's watchdog script, systemd unit",

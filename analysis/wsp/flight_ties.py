@@ -75,14 +75,15 @@ def _tie(flight: AppliedFlight, each: Numbered, place: Position) -> tuple[Row, C
     }
     if change is None or not over.speed_m_s >= LEAST_SPEED_M_S:
         return row, None
-    main = each.card.main
+    main, better = each.card.main, each.card.better
     found = {
         "prescribed_l_ha": row["prescribed_l_ha"],
         "applied_l_ha": over.applied_l_ha,
         "deposit_l_ha": main.l_ha,
         "coverage_percent": main.coverage_percent,
         "deposits_per_cm2": main.deposits_per_cm2,
-        "drops_per_cm2": each.card.better.drops_per_cm2,
+        "covered_percent": better.covered_percent,
+        "drops_per_cm2": better.drops_per_cm2,
     }
     return row, CardAtChange(
         card=each.number,
@@ -113,12 +114,12 @@ def tie_lines(ties: Ties) -> list[str]:
             "",
             f"deposit against distance from the change {before} -> {after} L/ha "
             "(negative: before it)",
-            "card  distance m  prescribed  on paper L/ha  cover %  depos./cm2",
+            "card  distance m  prescribed  on paper L/ha  cover* %  drops*/cm2",
         ]
         lines += [
             f"{row['card']:4d}  {row['distance_m']:+10.2f}  {_text(row['prescribed_l_ha'], 1):>10}"
-            f"  {row['deposit_l_ha']:13.2f}  {row['coverage_percent']:7.2f}"
-            f"  {row['deposits_per_cm2']:10.1f}"
+            f"  {row['deposit_l_ha']:13.2f}  {row['covered_percent']:8.2f}"
+            f"  {_text(row['drops_per_cm2'], 1):>10}"
             for row in table["cards"]
         ]
     return lines

@@ -129,9 +129,17 @@ def _prescription(config: Document) -> Rule:
 
 
 def mismatches(config: Document) -> Rule:
-    """Yield what `config check` refuses though the parts would run: widths that do not agree."""
+    """Yield what `config check` refuses though the parts would run: a plan that is not sprayed."""
     width_m = config.boom_table.width_m
-    mission = config.mission
+    mission, safety = config.mission, config.safety
+    if mission is not None and not (
+        safety.speed_min_m_s <= mission.speed_m_s <= safety.speed_max_m_s
+    ):
+        yield Contradiction(
+            key="mission.speed_m_s",
+            text=f"nothing is sprayed but from safety.speed_min_m_s = {safety.speed_min_m_s:g} to "
+            f"safety.speed_max_m_s = {safety.speed_max_m_s:g}; make them agree",
+        )
     if mission is not None and not _near(mission.swath_width_m, width_m):
         yield Contradiction(
             key="mission.swath_width_m",

@@ -299,12 +299,7 @@ def trial(
     except OSError as error:
         raise not_written(record, error) from None
     if png is not None:
-        names = {
-            f"plot {plot.number}": f"{plot.number}, block {plot.block}: "
-            f"{treatments[plot.treatment]:g} L/ha"
-            for plot in plots
-        }
-        draw_picture(map_file, png, title=out.name, names=names)
+        draw_picture(map_file, png, title=out.name, names=_names(plots, treatments))
     ok = not any(problem.severity == "error" for problem in problems)
     result = {
         "ok": ok,
@@ -320,6 +315,15 @@ def trial(
         note(problem_line(problem))
     answer(result, _lines(result, plots, design), as_json=as_json)
     raise typer.Exit(0 if ok else 1)
+
+
+def _names(plots: Sequence[Plot], rates_l_ha: Sequence[float]) -> dict[str, str]:
+    """Return what is written on the plots of the picture, by what the map calls them."""
+    return {
+        f"plot {plot.number}": f"{plot.number}, block {plot.block}: "
+        f"{rates_l_ha[plot.treatment]:g} L/ha"
+        for plot in plots
+    }
 
 
 def _treatments(rates: str, check: float | None) -> tuple[float, ...]:

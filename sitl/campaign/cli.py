@@ -246,7 +246,7 @@ def show(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show each figure by setting, what cases differ by, and which settings matter.
+    """Show figures by setting, what cases differ by, what matters.
 
     Intervals are over the seeds. Differences are from the first case, or from the first value of
     the first --by, each over pairs of one seed.

@@ -9,14 +9,21 @@ import numpy as np
 import pytest
 
 from analysis.flown.applied_flight import AppliedFlight, ValveChanges
+from analysis.wsp.card import Method, Reading, read_sheet
 from analysis.wsp.flight_ties import (
     CardAtChange,
     NearestChange,
+    Position,
     duty_at,
     nearest_change,
     passing,
+    read_positions,
     tables,
+    tie,
+    tie_lines,
 )
+from analysis.wsp.image import sheets_of
+from analysis.wsp.results import numbered
 from tests import builders
 from tests.pump_flight import pump, pump_setup
 
@@ -196,3 +203,37 @@ def test_a_pump_sprays_through_the_open_sections_only() -> None:
     assert opened is not None and closed is not None
     assert opened.applied_l_ha == pytest.approx(0.3 / (0.006 * SPEED_M_S), rel=0.01)
     assert closed.applied_l_ha == 0.0
+
+
+def test_deposit_against_distance_is_by_the_corrected_figures() -> None:
+    """On the example's cards, as they lay around a change of the flight."""
+    example = Path(__file__).resolve().parents[2] / "examples" / "paper"
+    (sheet,) = sheets_of(example / "scan.jpg")
+    cards = numbered([read_sheet(sheet, Reading(method=Method()))])
+    setup = flown().setup
+    places = {
+        each.number: Position(card=str(each.number), latitude_deg=at[0], longitude_deg=at[1])
+        for each, along in zip(cards, (38.5, 39.5, 40.5, 41.5), strict=True)
+        if (at := setup.frame.to_geographic(along, 3.0))
+    }
+    ties = tie(flown(), cards, places)
+    (table,) = ties.boundaries
+    lines = tie_lines(ties)
+    for each, row, line in zip(cards, table["cards"], lines[-4:], strict=True):
+        assert row["drops_per_cm2"] == each.card.better.drops_per_cm2
+        assert row["covered_percent"] == each.card.better.covered_percent
+        shown = line.split()[-2:]
+        assert shown == [f"{row['covered_percent']:.2f}", f"{row['drops_per_cm2']:.1f}"]
+        # It matters: the plain count misses drops in the stains of others.
+        assert row["drops_per_cm2"] > 1.05 * row["deposits_per_cm2"]
+
+
+def test_the_examples_scan_has_the_rates_that_it_was_drawn_with() -> None:
+    example = Path(__file__).resolve().parents[2] / "examples" / "paper"
+    (sheet,) = sheets_of(example / "scan.jpg")
+    cards = read_sheet(sheet, Reading(method=Method())).cards
+    drawn = (44.8, 47.2, 72.7, 75.1)
+    found = [card.better.drops_per_cm2 for card in cards]
+    assert found == pytest.approx(drawn, rel=0.12)
+    assert not any(card.flags for card in cards)
+    assert [each.card for each in read_positions(example / "cards.csv")] == ["1", "2", "3", "4"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -103,6 +104,40 @@ def test_lines_are_flown_no_faster_than_the_sprayer_keeps_up(
     assert 4.0 < low < high < 11.0
     ordered = {item.param2 for item in read_mission(tmp_path / "m.plan") if item.command == 178}
     assert {low, high, 11.0} <= ordered
+
+
+@pytest.mark.parametrize(
+    ("more", "text"),
+    [
+        (["--swath-m", "9"], "--swath-m 9: more than 2 % from boom.width_m = 6"),
+        (["--swath-m", "5.5"], "--swath-m 5.5: more than 2 % from boom.width_m = 6"),
+        (["--speed-m-s", "13"], "--speed-m-s 13: nothing is sprayed but from"),
+        (["--speed-m-s", "0.6"], "--speed-m-s 0.6: nothing is sprayed but from"),
+    ],
+)
+def test_what_config_check_refuses_is_not_planned(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, more: list[str], text: str
+) -> None:
+    code, found, _ = run(
+        capsys, ANYANG / "boundary.geojson", "--config", ANYANG / "config.toml", *more, *NAMED,
+        "--out", tmp_path / "m.plan",
+    )  # fmt: skip
+    assert code == 2
+    assert text in found["error"]
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_configuration_that_config_check_refuses_is_not_planned(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    shutil.copytree(ANYANG, tmp_path / "anyang")
+    path = tmp_path / "anyang" / "config.toml"
+    path.write_text(path.read_text().replace("speed_max_m_s = 12.0", "speed_max_m_s = 4.0"))
+    assert execute(["config", "check", str(path)]) != 0
+    assert "mission.speed_m_s" in capsys.readouterr().out
+    given = [tmp_path / "anyang" / "boundary.geojson", "--config", path, *NAMED]
+    code, found, _ = run(capsys, *given, "--out", tmp_path / "m.plan")
+    assert (code, "config.toml: mission.speed_m_s: nothing is" in found["error"]) == (2, True)
 
 
 def test_rates_beyond_the_sprayer_are_warned_of_with_a_place(
