@@ -15,6 +15,7 @@ where there is one, else those of the model, and say which.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
@@ -29,7 +30,8 @@ from analysis.dose import flow_samples, misapplied_parts
 from analysis.evaluation import Changes, Evaluation, changes_of, evaluate_strips
 from analysis.flown.applied_record import STEP_S, Source, modelled_ml, record_of
 from analysis.flown.holes import GAP_S
-from analysis.flown.modelled_flow import counted, ordered_s
+from analysis.flown.modelled_flow import metered_l, ordered_s
+from analysis.lag import Verdict
 from analysis.strips import Strip, strips_of
 from analysis.student import Interval, crossings_of, mean_interval, ratio_interval
 from companion.core.inputs import Fix
@@ -180,10 +182,7 @@ class Balance:
 def balance_of(flight: AppliedFlight, model_ml: float, asked_l: float) -> Balance:
     """Return the balance of a flight whose model put out `model_ml` where `asked_l` were asked."""
     model_l = model_ml / ML_PER_L
-    meter_l = None
-    if flight.meter_ml is not None:
-        _, count_ml = counted(flight.meter_ml)
-        meter_l = float(count_ml[-1]) / ML_PER_L if len(count_ml) > 1 else None
+    meter_l = metered_l(flight)
     start_l, end_l, refilled_l = _tank(flight)
     tank_l = None
     if start_l is not None and end_l is not None and refilled_l is not None:
@@ -472,7 +471,7 @@ class Figures:
     rate that this flight did not treat, `untreated_percent` its share of such ground; `missed_m2`
     of it lay under lines that were flown, `left_m2` is other flights'. What fell in the field, off
     the planned lines, is `off_line_ml`. `worst_m` is a bound over `lag_count` of
-    `change_count` changes: `analysis.assess.assessment`.
+    `change_count` changes, `unjudged` why not of the others: `analysis.assess.assessment`.
     """
 
     applied_l: float | None
@@ -488,6 +487,7 @@ class Figures:
     mean_lag_m: float | None
     lag_count: int
     change_count: int
+    unjudged: Mapping[str, int]
     worst_m: float | None
     worst_why_not: str
     outside_ml: float | None
@@ -519,6 +519,7 @@ def nothing_sprayed(area_ha: float | None, *, is_known: bool) -> Figures:
         mean_lag_m=None,
         lag_count=0,
         change_count=0,
+        unjudged={},
         worst_m=None,
         worst_why_not="nothing was sprayed" if is_known else "too little can be read",
         outside_ml=None,
@@ -561,6 +562,9 @@ def figures_of(
         mean_lag_m=evaluation.lag_distance_m.mean_abs,
         lag_count=evaluation.lag_distance_m.count,
         change_count=len(inside),
+        unjudged=dict(
+            Counter(step.verdict.value for step in inside if step.verdict is not Verdict.MEASURED)
+        ),
         worst_m=assessment.worst.bound_m,
         worst_why_not=assessment.worst.why_not,
         outside_ml=evaluation.off_target_ml,

@@ -299,9 +299,11 @@ def _sentence(result: dict[str, object]) -> str:
     rows = {"points": "points", "swaths": "polygons", "steps": "rows"}[str(result["geometry"])]
     mark = "" if result["training"] in ("no", "unknown") else f", training: {result['training']}"
     mark += ", SIMULATED" if result["simulated"] == "yes" else ""
+    metered_l = result["metered_l"]
+    meter = "" if metered_l is None else f" ({metered_l:.3f} L by the flow meter)"
     return (
-        f"{result['out']}: {result['rows']} {rows}, {result['volume_l']:.3f} L, "
-        f"{result['bytes']} bytes{mark}"
+        f"{result['out']}: {result['rows']} {rows}, {result['volume_l']:.3f} L modelled"
+        f"{meter}, {result['bytes']} bytes{mark}"
     )
 
 

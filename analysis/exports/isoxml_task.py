@@ -260,7 +260,10 @@ def _comments(source: Source) -> list[str]:
         f"simulated: {about.simulated}",
         f"clock: {about.utc_source}, times are UTC",
         f"map: {about.map_sha256[:_HASH_DIGITS]}",
+        "volumes: model of the executed changes",
     ]
+    if source.metered_l is not None:
+        lines.append(f"flow meter: {source.metered_l:.3f} L")
     if not about.is_closed:
         lines.append("record cut: end may be missing")
     if about.lost_rows:

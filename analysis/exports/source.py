@@ -20,6 +20,7 @@ from analysis.exports.samples import Samples, Swaths, samples_of, swaths_of
 from analysis.flight_record import FlightRecord
 from analysis.flown.applied_flight import AppliedFlight
 from analysis.flown.applied_record import record_of
+from analysis.flown.modelled_flow import metered_l
 
 Shape = Literal["points", "swaths", "steps"]
 
@@ -73,6 +74,11 @@ class Source:
         return float(self.record.volume_ml[-1].sum()) / 1000.0
 
     @property
+    def metered_l(self) -> float | None:
+        """Return what the flow meter counted; None without one."""
+        return metered_l(self.flight)
+
+    @property
     def rows(self) -> int:
         """Return how many rows an export of this shape has."""
         if self.shape == "steps":
@@ -90,7 +96,12 @@ class Source:
 
     def facts(self) -> dict[str, object]:
         """Return what is said of an export once: the flight, and the units of the columns."""
-        facts = self.about.as_json() | {"volume_l": round(self.volume_l, 6), "rows": self.rows}
+        facts = self.about.as_json() | {
+            "volume_l": round(self.volume_l, 6),
+            "volume_by": "model of the executed changes",
+            "metered_l": None if self.metered_l is None else round(self.metered_l, 6),
+            "rows": self.rows,
+        }
         if self.unread:
             facts["unread"] = list(self.unread)
         if self.shape == "swaths":

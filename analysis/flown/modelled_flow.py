@@ -189,6 +189,14 @@ def counted(series: Series) -> tuple[Floats, Floats]:
     return time_s, np.concatenate(([0.0], np.cumsum(np.where(rises >= 0.0, rises, value[1:]))))
 
 
+def metered_l(flight: AppliedFlight) -> float | None:
+    """Return what the flow meter counted in all; None without one."""
+    if flight.meter_ml is None:
+        return None
+    _, count_ml = counted(flight.meter_ml)
+    return float(count_ml[-1]) / 1000.0 if len(count_ml) > 1 else None
+
+
 def metered(flight: AppliedFlight, time_s: Floats, volume_ml: Floats) -> Floats:
     """Return the modelled volume with the meter's total; the model where there is no meter."""
     if flight.meter_ml is None:

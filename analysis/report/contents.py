@@ -325,12 +325,23 @@ def sentence_of(figures: Figures, training: str | None) -> str:
     return "; ".join(parts) + "."
 
 
+WHY_NOT = {
+    "small": "below 8 %",
+    "close": "too close to the next one",
+    "saturated": "at the end of the valves' range",
+    "border": "held by the border",
+    "unknown": "not recorded",
+    "missed": "that never came",
+}
+
+
 def judged_text(figures: Figures) -> str:
     """Return which changes a bound is for: of what was left out it says nothing."""
     count, every = figures.lag_count, figures.change_count
     if count == every:
         return f"all {count} changes of rate"
-    return f"the {count} of {every} changes of rate that can be judged"
+    others = ", ".join(f"{number} {WHY_NOT[name]}" for name, number in figures.unjudged.items())
+    return f"the {count} of {every} changes of rate that can be judged ({others})"
 
 
 def warnings_of(

@@ -94,7 +94,7 @@ def test_a_person_reads_a_sentence_with_the_mark_of_a_training(
     assert execute([*given, "--units", "us"]) == 0
     said = capsys.readouterr()
     assert said.out.startswith(f"{path}: ")
-    assert "polygons, 0.857 L, " in said.out
+    assert "polygons, 0.857 L modelled, " in said.out
     assert said.out.endswith("training: water\n")
     assert len(said.err.splitlines()) == 2
     first = json.loads(path.read_text())["features"][0]["properties"]

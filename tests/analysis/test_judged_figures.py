@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from analysis.assess.assessment import Assessment, assess
+from analysis.exports.source import Source
 from analysis.flown.read_applied import read_applied
 from analysis.report.build import ReportOptions, build_report
 from companion.cli.app import execute
@@ -77,7 +78,13 @@ def fly(folder: Path, zones: Any, lines: bool, *more: str) -> Flown:
     )  # fmt: skip
     if lines:
         config.write_text(text.replace("[mission]", '[mission]\nlines = "field.lines.geojson"'))
-    out = folder / "flown"
+    return flown_of(folder, plan, folder / "flown")
+
+
+def flown_of(folder: Path, plan: Path, out: Path) -> Flown:
+    """Fly a mission of the field in a folder, and make its report."""
+    config, plant, map_file = (folder / f for f in ("config.toml", "even.toml", "field.geojson"))
+    lines = "field.lines.geojson" in config.read_text()
     execute(
         ["sitl", "fly", "--config", str(config), "--mission", str(plan), "--plant", str(plant),
          "--out", str(out), "--json"]
@@ -134,6 +141,22 @@ def test_litres_are_what_the_truth_says(flown: Flown) -> None:
     assert said["off_line_ml"] == pytest.approx(true.off_line_ml, abs=1.0)
 
 
+def test_metered_and_modelled_litres_are_the_same_in_all_files(flown: Flown) -> None:
+    said = flown.contents["verdict"]
+    facts = Source(flight=flown.assessed.flight, shape="swaths").facts()
+    assert facts["volume_l"] == pytest.approx(said["modelled_l"], abs=1e-5)
+    assert facts["metered_l"] == pytest.approx(said["metered_l"], abs=1e-5)
+    assert flown.record["volume_l"]["value"] == round(said["metered_l"], 3)
+
+
+def test_no_headline_rests_on_changes_that_were_left_out(flown: Flown) -> None:
+    said = flown.contents["verdict"]
+    assert said["lag_count"] + sum(said["unjudged"].values()) == said["change_count"]
+    if said["worst_m"] is not None and said["unjudged"]:
+        part = f"the {said['lag_count']} of {said['change_count']} changes of rate"
+        assert part in said["sentence"]
+
+
 def test_asked_applied_and_area_are_of_the_same_ground(flown: Flown) -> None:
     said, true = flown.contents["verdict"], flown.verdict
     area = {"rel": 2.0 * AREA * true.field_m2 / true.treated_m2}
@@ -173,3 +196,27 @@ def test_ground_that_two_passes_sprayed_is_shown_with_both(
     assert cells is not None
     # A strip of half a metre got two doses: in cells of a metre half as much again.
     assert np.nanpercentile(cells.relative_error_percent, 95) > 30.0
+
+
+def test_what_sorties_missed_adds_up_to_what_all_of_them_left_bare(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    folder = tmp_path_factory.mktemp("job")
+    flights = [fly(folder, ASKEW, True, "--tank-l", "5")]
+    flights += [
+        flown_of(folder, folder / f"field-{number}.plan", folder / f"flown-{number}")
+        for number in range(2, 1 + len(list(folder.glob("field*.plan"))))
+    ]
+    assert len(flights) > 2
+    all_of_them = judge([each.truth for each in flights], flights[0].field)
+    figures = [each.contents["verdict"] for each in flights]
+    within = {"abs": 2.0 * AREA * all_of_them.field_m2}
+    # Where two sorties' bands meet, what one left bare the other may have treated.
+    assert sum(each["missed_m2"] for each in figures) == pytest.approx(
+        all_of_them.bare_m2, **within
+    )
+    treated_m2 = sum(1e4 * each["area_ha"] - each["doubled_m2"] for each in figures)
+    assert treated_m2 == pytest.approx(all_of_them.treated_m2, **within)
+    assert sum(each["metered_l"] for each in figures) == pytest.approx(
+        all_of_them.applied_l, rel=LITRES
+    )
