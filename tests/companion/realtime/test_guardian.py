@@ -8,18 +8,20 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, suppress
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager, suppress
 from pathlib import Path
 
 import pytest
 
 from analysis.journals.content import read_journal
 from companion.guardian import AFTER_S
+from companion.guardian.__main__ import LINK_NUMBER
 from tests.bench.dead_man import EXAMPLE, children_of, peer_in_the_middle
 from tests.companion.wire_peer import TcpHost, WirePeer, free_port, over_udp
 
 pytestmark = pytest.mark.sitl
+KEY = bytes(range(32))
 
 
 @pytest.fixture
@@ -107,6 +109,8 @@ async def started(
 async def begun(process: asyncio.subprocess.Process, peer: WirePeer) -> Spraying:
     found = Spraying(process, peer)
     await peer.until(lambda: peer.is_ready, within_s=20.0)
+    if peer.clock is not None:  # signed: the first question of the time has its answer by then
+        await peer.until(lambda: len(peer.of("TIMESYNC")) >= 2, within_s=20.0)
     peer.place(east_m=-6.0)
     peer.enable()
     await found.opens_again()
@@ -296,6 +300,96 @@ async def test_one_that_is_killed_before_it_heard_the_vehicle_leaves_it_to_the_n
         peer.is_silent = False
         async with started(config, url):
             await peer.until(lambda: peer.is_all_closed, within_s=20.0)
+
+
+MEMORY = Path("/sys/fs/cgroup/memory")
+HOG = """
+import pathlib
+pathlib.Path({procs!r}).write_text("0")
+held = []
+while True:
+    held.append(bytearray(1 << 20))
+"""
+
+
+def end_first(pid: int) -> None:
+    """Have the kernel end a process before others when memory is short."""
+    Path(f"/proc/{pid}/oom_score_adj").write_text("1000")
+
+
+@contextmanager
+def short_of_memory(pid: int, *others: int) -> Iterator[list[str]]:
+    """Have processes in a control group of 64 MB; yield a command that takes these."""
+    group = MEMORY / f"vrspray-test-{pid}"
+    group.mkdir()
+    try:
+        for each in (pid, *others):
+            (group / "cgroup.procs").write_text(str(each))
+        (group / "memory.limit_in_bytes").write_text(str(64 << 20))
+        yield [sys.executable, "-c", HOG.format(procs=str(group / "cgroup.procs"))]
+    finally:
+        for each in (group / "cgroup.procs").read_text().split():
+            with suppress(OSError):
+                (MEMORY / "cgroup.procs").write_text(each)
+        group.rmdir()
+
+
+@pytest.mark.skipif(
+    not os.access(MEMORY / "memory.limit_in_bytes", os.W_OK) and not os.access(MEMORY, os.W_OK),
+    reason="no control group of memory that may be made",
+)
+async def test_short_of_memory_the_kernel_ends_the_companion_and_the_guardian_closes(
+    config: Path,
+) -> None:
+    async with spraying(config) as flight:
+        companion, guardian = flight.process.pid, flight.guardian
+        with short_of_memory(companion, guardian) as command:
+            # Of two that may end, the companion: elsewhere the one that wants most.
+            end_first(companion)
+            hog = await asyncio.create_subprocess_exec(*command)
+            try:
+                await flight.peer.until(lambda: flight.peer.is_all_closed, within_s=20.0)
+            finally:
+                with suppress(ProcessLookupError):
+                    hog.kill()
+                await hog.wait()
+        assert await flight.process.wait() == -signal.SIGKILL
+        await is_gone(guardian)
+    assert (config.parent / "state" / "guardian.json").exists(), "it was not ended with them"
+
+
+async def test_on_a_signed_link_its_orders_are_signed_and_newer_than_the_companions(
+    config: Path,
+) -> None:
+    """The vehicle takes no frame that is unsigned, or older than one before on its stream."""
+    key = config.parent / "key"
+    key.write_text(KEY.hex())
+    key.chmod(0o600)
+    port, peer = free_port(), peer_in_the_middle()
+    peer.sign(KEY)
+    peer.answers_time = True
+    taken: list[tuple[int, int]] = []
+    feed = peer.feed
+
+    def look(data: bytes) -> None:
+        before = len(peer.orders)
+        feed(data)
+        if len(peer.orders) > before:
+            taken.append((data[-13], int.from_bytes(data[-12:-6], "little")))
+
+    peer.feed = look  # type: ignore[method-assign]
+    url = f"udpin:127.0.0.1:{port}"
+    async with (
+        started(config, url, f"link.signing_key_file={key}") as process,
+        over_udp(peer, port),
+    ):
+        flight = await begun(process, peer)
+        newest = max(stamp for _, stamp in taken)
+        before = len(taken)
+        assert await flight.closed_s(process.kill) <= 0.5
+        after = [(link, stamp) for link, stamp in taken[before:] if link == LINK_NUMBER]
+    assert after
+    assert newest < min(stamp for _, stamp in after)
 
 
 async def test_over_tcp_and_after_half_a_frame(config: Path) -> None:
