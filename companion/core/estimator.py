@@ -31,12 +31,14 @@ from companion.core.motion import (
     DOUBTING,
     MANOEUVRE,
     NOT_DRAWN,
+    NOT_RAMPED,
     SHARE_MIN,
     STEADY,
     Axis,
     Belief,
     Drawn,
     Pair,
+    Ramp,
     Seen,
     Told,
     Turning,
@@ -121,6 +123,7 @@ class Motion(NamedTuple):
     height_m: float
     velocity_known: bool
     confirm_left: int
+    ramp: tuple[Ramp, Ramp] = (NOT_RAMPED, NOT_RAMPED)
     likely: float | None = None  # how the filters found the last message; None: they begin with it
 
     def after(self, dt_s: float) -> tuple[Told, Told]:
@@ -187,6 +190,8 @@ def followed(before: Motion, item: Telemetry, place: tuple[float, float], time_s
         doubting, share = believing, SHARE_MIN
     elif known:
         share = doubted(share, dt_s, believing[1], doubting[1])
+    both = agreed(believing[0], doubting[0], share)
+    calm, nimble = both.cruise, both.manoeuvre
     return Motion(
         time_s=time_s,
         boot_s=item.boot_s,
@@ -194,13 +199,17 @@ def followed(before: Motion, item: Telemetry, place: tuple[float, float], time_s
         believing=believing[0],
         doubting=doubting[0],
         doubt_share=share,
-        agreed=agreed(believing[0], doubting[0], share),
+        agreed=both,
         seen=(east, north),
         drawn=(
             drawn_after(before.drawn[0], dt_s, before.seen[0], east),
             drawn_after(before.drawn[1], dt_s, before.seen[1], north),
         ),
         heading_deg=item.heading_deg,
+        ramp=(
+            before.ramp[0].followed(dt_s, calm.east, nimble.east, both.share),
+            before.ramp[1].followed(dt_s, calm.north, nimble.north, both.share),
+        ),
         yaw=turning(before.yaw, before.heading_deg, item.heading_deg, dt_s),
         height_m=item.relative_altitude_m,
         velocity_known=known,
@@ -445,7 +454,7 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         return None
     dt_s = now_s - motion.time_s
     nose_deg, (turned_deg, yaw) = motion.heading_deg, motion.yaw.ending.after(dt_s)
-    east, north = _after(track.inertia, motion, dt_s)
+    east, north = _after(track, motion, dt_s)
     velocity_east, velocity_north = east.velocity_m_s, north.velocity_m_s
     checked, known = _checked_speed(track, now_s), motion.velocity_known
     if not known and checked is not None:
@@ -503,9 +512,13 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
     )
 
 
-def _after(inertia: Inertia, motion: Motion, dt_s: float) -> tuple[Told, Told]:
+def _after(track: Track, motion: Motion, dt_s: float) -> tuple[Told, Told]:
     """Return the motion `dt_s` after the last position, by all that is known of it."""
     east, north = motion.after(dt_s)
+    if track.heartbeat is not None and track.heartbeat.mode in MISSION_MODES:
+        doubt, (by_east, by_north) = motion.doubt_share, motion.ramp
+        east, north = by_east.after(east, dt_s, doubt), by_north.after(north, dt_s, doubt)
+    inertia = track.inertia
     by_inertia = inertia.after(dt_s, motion.acceleration_fade_s)
     if by_inertia is None:
         return east, north

@@ -554,6 +554,49 @@ def drawn_after(by: Drawn, dt_s: float, before: Seen, now: Seen) -> Drawn:
     return followed(by, dt_s, now.position_m - before.position_m, told_m_s)
 
 
+# How fast an acceleration changes where an autopilot flies a mission: it ramps it (ArduCopter by
+# 1 m/s3, PX4 by 4), and the filters, which expect it to fade, tell it RAMP_LATE_S late. Fitted to
+# the told speeds of one flown ArduCopter and checked on another, at 5 and 10 Hz: of the speed 0.2 s
+# ahead 0.041 m/s are wrong (rms), 0.055 without.
+RAMP_TIME_S, RAMP_LATE_S, RAMP_MAX_M_S3 = 0.5, 0.18, 2.0
+
+
+class Ramp(NamedTuple):
+    """A slow mean of the acceleration in one direction, and how fast that changes."""
+
+    slow_m_s2: float = 0.0
+    gain_m_s3: float = 0.0
+
+    def followed(self, dt_s: float, first: Axis, second: Axis, share: float) -> Ramp:
+        """Return it after a message: `share` of the second and the rest of the first are true."""
+        now = first.acceleration_m_s2
+        now += share * (second.acceleration_m_s2 - now)
+        slow = self.slow_m_s2 + (1.0 - exp(-dt_s / RAMP_TIME_S)) * (now - self.slow_m_s2)
+        gain = (now - slow) / RAMP_TIME_S
+        return Ramp(slow, min(max(gain, -RAMP_MAX_M_S3), RAMP_MAX_M_S3))
+
+    def after(self, told: Told, dt_s: float, share: float) -> Told:
+        """Return a motion `dt_s` after the message with the ramp in it; `share` doubt the velocity.
+
+        Only a stream that an estimator has smoothed says how an acceleration changes: none is
+        believed before half of the doubt is there.
+
+        >>> Ramp(0.0, 1.0).after(Told(0.0, 5.0, 1.0, 0.0), 0.1, 1.0).velocity_m_s.__round__(3)
+        5.023
+        """
+        share = 2.0 * share - 1.0
+        if not (share > 0.0 and dt_s > 0.0):
+            return told
+        gain, dt_s = share * self.gain_m_s3, min(dt_s, RAMP_TIME_S)
+        return told._replace(
+            velocity_m_s=told.velocity_m_s + gain * dt_s * (RAMP_LATE_S + 0.5 * dt_s),
+            acceleration_m_s2=told.acceleration_m_s2 + gain * (RAMP_LATE_S + dt_s),
+        )
+
+
+NOT_RAMPED = Ramp()
+
+
 class Turning(NamedTuple):
     """How the nose turns: its rate, and how fast that changes; the change fades."""
 
