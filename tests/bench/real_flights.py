@@ -12,13 +12,16 @@ import argparse
 import json
 import os
 import sys
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from companion.errors import ConfigError
-from sitl.along import AlongOptions, fly_along
+from sitl.along import AlongOptions, fly_along, prepare
+from tests import holes_judge
 
 # By rate: misapplied over perfect knowledge's, in turns too, and how far the median lag may be off.
+HOLES_HZ = 10.0
 BARS = {10.0: (1.5, 2.5, (1.3, 0.02)), 5.0: (2.5, None, None)}
 
 
@@ -63,8 +66,23 @@ def flown(log: Path, rate_hz: float, flights: int) -> dict[str, Any]:
     found["knows_the_future"] = rate_hz > 1.05 * found["recorded_rate_hz"]
     by_hand = not set(found["modes"]) <= {"AUTO", "MISSION"}
     rows = {row["method"]: row for row in found["methods"]}
+    ours, theirs = at_holes(options)
+    found["holes"] = {"vrspray": asdict(ours), "reference": asdict(theirs)}
     found["bars"] = [] if by_hand or found["knows_the_future"] else bars_of(rows, rate_hz)
+    if found["bars"] and rate_hz == HOLES_HZ:
+        named = [
+            dict(zip(("of", "is", "limit"), bar, strict=True))
+            for bar in holes_judge.bars(ours, theirs)
+        ]
+        found["bars"] += [bar | {"broken": not bar["is"] <= bar["limit"]} for bar in named]
     return found
+
+
+def at_holes(options: AlongOptions) -> tuple[holes_judge.Early, holes_judge.Early]:
+    """Return how early valves close before holes in the field, and who knows the true state."""
+    seeds = range(options.seed, options.seed + options.flights)
+    beds = [prepare(replace(options, seed=seed)) for seed in seeds]
+    return holes_judge.judged(beds, seeds)
 
 
 def bars_of(rows: dict[str, Any], rate_hz: float) -> list[dict[str, Any]]:
@@ -102,6 +120,12 @@ def say(found: dict[str, Any]) -> None:
             f"{number(row['turn_misapplied_percent'], digits=1):>10}"
             f"{number(lag, 'mean_abs'):>8}{number(lag, 'median_abs'):>8}"
             f"{number(row['switch_m'], 'mean_abs'):>8}{missed:>11}"
+        )
+    for name, early in found["holes"].items():
+        tell(
+            f"  holes, {name}: {early['closings']} closings {number(early, 'mean_m')} m before "
+            f"(median {number(early, 'median_m')}), {number(early, 'beyond_m', 2)} m beyond at "
+            f"most, {number(early, 'lost_percent', 2)} % of the ground lost"
         )
     for bar in found["bars"]:
         word = "broken" if bar["broken"] else "holds"

@@ -249,6 +249,15 @@ def test_a_heading_that_is_no_number_or_jumps_leaves_no_turn_beyond_what_can_be(
         assert math.isfinite(found.gain_deg_s2)
 
 
+@pytest.mark.parametrize("jump_deg", [73.0, -34.0, 175.0])
+def test_a_heading_that_an_estimator_sets_anew_is_no_turn(jump_deg: float) -> None:
+    found = turning(Turning(38.0, 4.0), 165.0, (165.0 + jump_deg) % 360.0, 0.1)
+    assert found == STEADY
+    assert turning(found, 12.0, 15.8, 0.1).rate_deg_s == pytest.approx(36.0, abs=3.0)
+    # A turn that begins within one message, as fast as any that is flown, is one.
+    assert turning(STEADY, 0.0, 24.0, 0.1).rate_deg_s > 200.0
+
+
 @pytest.mark.parametrize("gain_deg_s2", [40.0, -40.0])
 def test_of_an_open_boom_only_the_valves_that_go_back_close(gain_deg_s2: float) -> None:
     wide = setup(
