@@ -24,7 +24,8 @@ __all__ = ["DITHER_S", "Order", "ServoExecutor", "ServoOptions"]
 _logger = logging.getLogger(__name__)
 
 # How much later than one that left behind it an order may arrive: Linux holds back Wi-Fi frames
-# for a missing one for at most 0.1 s (mac80211, HT_RX_REORDER_BUF_TIMEOUT). A wire keeps the order.
+# for a missing one for at most HZ / 10 (net/mac80211/rx.c, HT_RX_REORDER_BUF_TIMEOUT; mwifiex: 50
+# ms). A wire keeps the order.
 REORDER_S = 0.1
 # After a refusal the closing orders go on, but seldom: each costs a text on the pilot's screen.
 _REFRESH_FAULT_S = 5.0

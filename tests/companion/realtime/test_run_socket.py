@@ -13,7 +13,10 @@ import pytest
 
 from companion.core.types import Inhibit
 from companion.errors import LinkError
+from companion.output.servo import REORDER_S
 from companion.runtime import execute, run
+from tests.companion.realtime.udp_router import a_way
+from tests.companion.test_overtaken_orders import Swapping
 from tests.companion.test_run_flight import SETUP, Companion, Flight, Scribe
 from tests.companion.wire_peer import TcpHost, WirePeer, free_port, over_udp
 
@@ -62,6 +65,33 @@ async def test_it_sprays_over_udp_and_a_second_one_is_refused_the_port(flight: F
     assert second.executor.order_count == 0
     flight.peer.enable(False)
     await flight.peer.until(lambda: flight.peer.is_all_closed)
+
+
+async def test_orders_that_overtake_each_other_on_the_way_leave_no_valve_open() -> None:
+    """As on Wi-Fi: an order to open waits up to 0.09 s, behind one to close that left later."""
+    port = free_port()
+    _, _, east_m, _ = SETUP.prescription.bounds_m
+    companion = Companion(f"udpin:127.0.0.1:{port}")
+    companion.start()
+    peer = WirePeer(SETUP.frame, east_m=2.0)
+    async with a_way(port) as (vehicle, ours):
+        way = Swapping(vehicle)
+        ours.take = way.deliver
+        async with over_udp(peer, vehicle.transport.get_extra_info("sockname")[1]):
+            await peer.until(lambda: len(peer.outputs) == 6)
+            for number in range(6):
+                # Refreshes have another place in each crossing: six valves take turns in a second.
+                peer.place(east_m=east_m - 9.0 - 0.37 * number)
+                peer.enable()
+                await peer.until(lambda: len(peer.open_channels) == 6)
+                await peer.until(lambda: peer.is_all_closed)
+                beats = len(peer.of("HEARTBEAT"))
+                await peer.until(lambda beats=beats: len(peer.of("HEARTBEAT")) >= beats + 2)
+                peer.enable(False)
+    companion.task.cancel()  # type: ignore[union-attr]
+    await asyncio.gather(companion.task, return_exceptions=True)  # type: ignore[arg-type]
+    # Its refresh alone would close it up to a second later.
+    assert way.stayed_open_s <= 3.0 * REORDER_S
 
 
 async def test_a_lost_tcp_link_closes_and_comes_back_closed_first() -> None:
