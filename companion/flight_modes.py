@@ -88,20 +88,25 @@ PX4_AUTO = {
 _BY_NUMBER = re.compile(r"MODE \d+(\.\d+)?")
 
 
-def known_modes() -> frozenset[str]:
-    """Return the names of all modes in which a vehicle can be told to be.
+_TABLES = {"ardupilot": (COPTER, PLANE, ROVER), "px4": (PX4_MAIN, PX4_AUTO)}
 
-    >>> {"AUTO", "MISSION"} <= known_modes()
-    True
+
+def known_modes(*autopilots: str) -> frozenset[str]:
+    """Return the names of all modes in which a vehicle, with one of these, can be told to be.
+
+    >>> {"AUTO", "MISSION"} <= known_modes(), "AUTO" in known_modes("px4")
+    (True, False)
     """
-    tables = (COPTER, PLANE, ROVER, PX4_MAIN, PX4_AUTO)
-    return frozenset(name for table in tables for name in table.values())
+    every = autopilots or tuple(_TABLES)
+    names = frozenset(name for one in every for table in _TABLES[one] for name in table.values())
+    # Of PX4 a mode of AUTO goes by its own name.
+    return names if "ardupilot" in every else names - {"AUTO"}
 
 
-def is_mode(name: str) -> bool:
+def is_mode(name: str, *autopilots: str) -> bool:
     """Return whether a vehicle can be in a mode of this name.
 
     >>> is_mode("auto"), is_mode("MODE 31"), is_mode("ATUO")
     (True, True, False)
     """
-    return name.upper() in known_modes() or _BY_NUMBER.fullmatch(name.upper()) is not None
+    return name.upper() in known_modes(*autopilots) or bool(_BY_NUMBER.fullmatch(name.upper()))

@@ -222,6 +222,15 @@ def _every(config: Document) -> dict[str, PumpTable | AtomiserTable]:
     return every
 
 
+def on_autopilot(config: Document) -> dict[str, int | None]:
+    """Return the motors' outputs of the autopilot, by key."""
+    return {
+        f"{key}.channel": table.channel
+        for key, table in _every(config).items()
+        if table.output == "autopilot"
+    }
+
+
 def _closed_pulse(config: Document) -> Found:
     """Yield a closed pulse at which a motor runs.
 

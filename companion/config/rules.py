@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 # MAV_CMD_DO_SET_SERVO: ArduPilot has at most 32 outputs (SERVO1 to SERVO32).
 SERVO_OUTPUTS = 32
+# DO_SET_ACTUATOR: PX4 has six.
+PX4_OUTPUTS = 6
 # One request of the kernel's GPIO interface has 64 lines at most, a chain of registers as many.
 LINES_MAX = 64
 GPIO_LAST = {"lines": 1023, "spi595": LINES_MAX - 1}
@@ -156,6 +158,42 @@ def mismatches(config: Document) -> Rule:
     else:
         yield from _untiled(config)
     yield from _no_modes(config)
+    yield from _autopilot(config)
+
+
+def _autopilot(config: Document) -> Rule:
+    """Yield what the autopilot that is named cannot do; of one that is not, nothing is known."""
+    mission = config.mission
+    if mission is None or "autopilot" not in mission.model_fields_set:
+        return
+    is_px4 = mission.autopilot == "px4"
+    if not any(is_mode(mode, mission.autopilot) for mode in config.safety.modes):
+        name, mode = ("PX4", "MISSION") if is_px4 else ("ArduPilot", "AUTO")
+        yield Contradiction(
+            key="safety.modes",
+            text=f'{name} has none of these modes, so nothing would be sprayed; write "{mode}"',
+        )
+    if not is_px4:
+        return
+    channels: dict[str, int | None] = {}
+    if config.output.kind == "servo":
+        channels |= {f"valve[{n}].channel": each.channel for n, each in enumerate(config.valve)}
+        channels["output.return_channel"] = config.output.return_channel
+    if config.has_motors and config.output.kind != "none":
+        from companion.config.motor_rules import on_autopilot
+
+        channels |= on_autopilot(config)
+    used = {key: channel for key, channel in channels.items() if channel is not None}
+    if len(used) > PX4_OUTPUTS:
+        yield Contradiction(
+            key="valve",
+            text=f"{len(used)} outputs, but PX4 takes orders for {PX4_OUTPUTS}; use fewer valves, "
+            "GPIO lines, or ArduPilot",
+        )
+        return
+    for key, channel in used.items():
+        if not 1 <= channel <= PX4_OUTPUTS:
+            yield Contradiction(key=key, text="PX4 numbers its actuators from 1 to 6; write one")
 
 
 def _untiled(config: Document) -> Rule:

@@ -28,6 +28,8 @@ def test_what_is_written_passes_the_check(
     autopilot: str, output: str, valves: str, tmp_path: Path, capsys: Captured
 ) -> None:
     out = tmp_path / "field.toml"
+    if (autopilot, output, valves) == ("px4", "servo", "16"):
+        pytest.skip("PX4 has six")
     words = ["--autopilot", autopilot, "--output", output, "--valves", valves]
     assert execute(["config", "new", "--yes", "--out", str(out), *words, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
@@ -87,6 +89,51 @@ def test_px4_without_a_board_is_said_to_spray_nothing(tmp_path: Path, capsys: Ca
     assert "nothing will be sprayed" in capsys.readouterr().out
     assert execute(["doctor", "--no-link", *given]) in (0, 1)
     assert "warn  output-guard: PX4 has no watchdog script" in capsys.readouterr().out
+
+
+PX4 = ("--autopilot", "px4")
+
+
+@pytest.mark.parametrize(
+    ("made", "changes", "key"),
+    [
+        ((*PX4,), ("output.return_channel=7",), "valve"),
+        ((*PX4, "--valves", "5"), ("output.return_channel=7",), "output.return_channel"),
+        ((*PX4, "--valves", "4"), ("valve[3].channel=9",), "valve[3].channel"),
+        ((*PX4,), ('safety.modes=["AUTO"]',), "safety.modes"),
+        ((), ('safety.modes=["MISSION"]',), "safety.modes"),
+    ],
+)
+def test_what_its_autopilot_cannot_do_is_refused_before_it_is_built(
+    made: tuple[str, ...], changes: tuple[str, ...], key: str, tmp_path: Path, capsys: Captured
+) -> None:
+    out = tmp_path / "field.toml"
+    assert execute(["config", "new", "--yes", "--out", str(out), *made]) == 0
+    given = [word for change in changes for word in ("--set", change)]
+    assert execute(["config", "check", str(out)]) == 0
+    capsys.readouterr()
+    assert execute(["config", "check", str(out), *given, "--json"]) == 2
+    (found,) = [
+        each for each in json.loads(capsys.readouterr().out)["problems"]
+        if each["severity"] == "error"
+    ]  # fmt: skip
+    assert found["where"] == key
+    assert execute(["doctor", "--config", str(out), "--no-link", *given]) == 1
+    assert f"fail  configuration: {key}: " in capsys.readouterr().out
+
+
+def test_px4_takes_no_eight_valves(tmp_path: Path, capsys: Captured) -> None:
+    out = tmp_path / "field.toml"
+    words = ["config", "new", "--yes", "--out", str(out), "--valves", "8"]
+    assert execute([*words, *PX4]) == 2
+    assert "PX4 takes orders for 6" in capsys.readouterr().err
+    assert not out.exists()
+    # Nothing is known of an autopilot that is not named; lines of this computer are as many.
+    assert execute([*words, *PX4, "--output", "gpio"]) == 0
+    assert execute([*words, "--force"]) == 0
+    text = out.read_text().replace('autopilot = "ardupilot"\n', "")
+    out.write_text(text)
+    assert execute(["config", "check", str(out), "--set", 'safety.modes=["MISSION"]']) == 0
 
 
 @pytest.mark.parametrize("command", ["check", "show"])
