@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,6 +17,9 @@ from companion.config import Config, load
 from companion.config.rules import mismatches, remarks, without_effect
 from companion.errors import ConfigError, MapError, Problem
 from companion.wording import show_value
+
+if TYPE_CHECKING:
+    from companion.cli.new_config import Answers
 
 app = typer.Typer(
     add_completion=False,
@@ -162,7 +166,7 @@ def new(
             unit=unit,
             swath_m=swath_m,
         )
-        answers = given if yes else new_config.ask_all(given, _ask, note)
+        answers = given if yes else new_config.ask_all(given, _ask, note, _tried)
         text = new_config.text_of(answers, map_name=new_config.map_seen_from(out, answers.map_file))
     config, found = new_config.write_checked(out, text, problems_of)
     problems = [problem_object(problem) for problem in found]
@@ -178,6 +182,19 @@ def new(
         ],
         as_json=as_json,
     )
+
+
+def _tried(answers: Answers) -> None:
+    """Refuse answers that make no configuration, while they can still be asked again."""
+    from companion.cli import new_config
+
+    with TemporaryDirectory() as folder:
+        out = Path(folder, "new.toml")
+        try:
+            new_config.write_checked(out, new_config.text_of(answers), problems_of)
+        except ConfigError as error:
+            text = str(error).removeprefix(f"{out}: ").removesuffix(f"; {out} is not written")
+            raise ConfigError(text) from error
 
 
 def _ask(question: str, default: str) -> str:

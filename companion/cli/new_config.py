@@ -19,6 +19,7 @@ from companion.cli.answer import problem_line, problem_object
 from companion.cli.app import find_command, load_command
 from companion.commands import registered
 from companion.config import Config, load
+from companion.config.rules import SWATH_TOLERANCE
 from companion.errors import ConfigError, MapError, Problem, VrsprayError
 
 Ask = Callable[[str, str], str]
@@ -47,9 +48,12 @@ VALVES_MAX = 64
 _FROM_PROFILE = """\
 # Written by `vrspray config new` from a profile. Its figures and the lines below are of the sprayer
 # that the profile was made for: check each against yours, and measure yours."""
-# ISO 10625: the size is the flow in tenths of a US gallon a minute at 40 psi (2.76 bar).
+# ISO 10625: the first two digits of a size, and tenths behind them, are the flow in tenths of a US
+# gallon a minute at 40 psi (2.76 bar): 015 is 1.5.
 _ISO_L_MIN, _ISO_BAR = 0.37854, 2.758
-_ISO = re.compile(r"(?:iso )?0*(\d{1,2}(?:\.\d)?) at (\d{1,2}(?:\.\d+)?) ?bar")
+_ISO = re.compile(r"(iso ?)?(\d{1,2})\.?(\d*)(?: ?(?:at|@) ?(\d+(?:\.\d+)?) ?(bar|psi|kpa))?")
+_BAR = {"bar": 1.0, "psi": 0.0689476, "kpa": 0.01}
+FLOWS = "write L/min (0.8), or an ISO size with its pressure (03 at 3 bar, at 40 psi, at 300 kPa)"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,10 +84,16 @@ class Answers:
         return self.valves * self.spacing_m if self.swath_m is None else self.swath_m
 
 
-def ask_all(answers: Answers, ask: Ask, complain: Callable[[str], None]) -> Answers:
+def ask_all(
+    answers: Answers,
+    ask: Ask,
+    complain: Callable[[str], None],
+    check: Callable[[Answers], None] = lambda _: None,
+) -> Answers:
     """Return the answers after six questions; one whose answer cannot be is asked again.
 
-    `ask` gets a question and its default; `complain` is told what is wrong with an answer.
+    `ask` gets a question and its default; `complain` is told what is wrong with an answer; `check`
+    raises for answers that make no configuration. The first two are tried with a single valve.
     """
 
     def asked(
@@ -91,7 +101,10 @@ def ask_all(answers: Answers, ask: Ask, complain: Callable[[str], None]) -> Answ
     ) -> Answers:
         while True:
             try:
-                return take(so_far, ask(question, default))
+                found = take(so_far, ask(question, default))
+                is_early = question.startswith(("1", "2"))
+                check(replace(found, valves=1, swath_m=None) if is_early else found)
+                return found
             except VrsprayError as error:
                 complain(str(error))
 
@@ -155,14 +168,19 @@ def known_unit(unit: str) -> str:
 def nozzle_flow(text: str) -> float:
     """Return the flow of a valve, of a figure in L/min or of an ISO size at a pressure.
 
-    >>> nozzle_flow("0.8"), round(nozzle_flow("03 at 3 bar"), 3)
+    >>> nozzle_flow("0,8 L/min"), round(nozzle_flow("03 at 3 bar"), 3)
     (0.8, 1.184)
     """
-    size = _ISO.fullmatch(" ".join(text.lower().split()))
-    if size is None:
-        return _number(text, "flow of one valve", 0.01, 100.0)
-    flow = float(size[1]) * _ISO_L_MIN * math.sqrt(float(size[2]) / _ISO_BAR)
-    return _number(f"{flow}", "flow of one valve", 0.01, 100.0)
+    plain = " ".join(text.lower().replace(",", ".").split()).removesuffix("l/min").strip()
+    size = _ISO.fullmatch(plain)
+    is_size = size is not None and bool(size[1] or size[4] or re.match(r"0\d", plain))
+    if size is None or not is_size:
+        return _number(plain, "flow of one valve", 0.01, 100.0, FLOWS)
+    if size[4] is None:
+        raise ConfigError(f"{text}: an ISO size says no flow without its pressure; {FLOWS}")
+    bar = float(size[4]) * _BAR[size[5]]
+    flow = float(f"{size[2]}.{size[3]}") * _ISO_L_MIN * math.sqrt(bar / _ISO_BAR)
+    return _number(f"{flow}", "flow of one valve", 0.01, 100.0, FLOWS)
 
 
 def bucket_curves(csv: str) -> tuple[Mapping[str, Any], ...]:
@@ -220,7 +238,8 @@ def _outputs(answers: Answers) -> list[str]:
 
 
 def _with_valves(answers: Answers, text: str) -> Answers:
-    words = text.replace(",", " ").split()
+    # A comma that stands between the two numbers, or in one of them for decimals.
+    words = [word.strip(",") for word in (text.split() if " " in text.strip() else text.split(","))]
     if len(words) != 2:
         raise ConfigError(f"{' '.join(words)!r}: write two numbers, such as 6 1.0")
     count = _number(words[0], "number of valves", 1, VALVES_MAX)
@@ -266,16 +285,25 @@ def _with_its_unit(answers: Answers) -> Answers:
 
 
 def _with_swath(answers: Answers, text: str) -> Answers:
-    return replace(answers, swath_m=_number(text, "swath", 0.1, 100.0))
+    swath_m, wide_m = _number(text, "swath", 0.1, 100.0), answers.valves * answers.spacing_m
+    # Strips of another width than the spacing would lie over each other, or apart.
+    if answers.valves > 1 and abs(swath_m - wide_m) > SWATH_TOLERANCE * wide_m:
+        raise ConfigError(
+            f"swath {swath_m:g}: {answers.valves} valves {answers.spacing_m:g} m apart cover "
+            f"{wide_m:g} m; write that, or another spacing"
+        )
+    return replace(answers, swath_m=swath_m)
 
 
-def _number(text: str, what: str, least: float, most: float) -> float:
+def _number(text: str, what: str, least: float, most: float, forms: str = "") -> float:
     try:
-        value = float(text)
+        value = float(text.replace(",", "."))
     except ValueError:
         value = math.nan
     if not least <= value <= most:
-        raise ConfigError(f"{what} {text!r}: write a number from {least:g} to {most:g}")
+        raise ConfigError(
+            f"{what} {text!r}: {forms or f'write a number from {least:g} to {most:g}'}"
+        )
     return value
 
 

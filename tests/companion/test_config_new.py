@@ -167,12 +167,62 @@ def test_six_questions_are_asked_and_answered(tmp_path: Path) -> None:
 
 def test_what_cannot_be_is_asked_again(tmp_path: Path) -> None:
     out = tmp_path / "field.toml"
-    said = f"rover\npx4\nrelay\nservo\n6\n6 1\nnone.csv\nblue\n1.5\nno-map.shp\n{MAP}\nwide\n5\n"
+    said = f"rover\npx4\nrelay\nservo\n6\n6 1\nnone.csv\nblue\n1.5\nno-map.shp\n{MAP}\nwide\n6\n"
     done = CliRunner().invoke(app, ["config", "new", "--out", str(out)], input=said)
     assert done.exit_code == 0, done.output
     assert [done.output.count(f"{number}. ") for number in range(1, 7)] == [2, 2, 2, 3, 2, 2]
     assert "none.csv: there is no such file" in done.output
-    assert load(out).boom_table.width_m == 5.0
+    assert load(out).boom_table.width_m == 6.0
+
+
+def test_an_answer_that_the_configuration_refuses_is_asked_again_at_once(tmp_path: Path) -> None:
+    """The sixth question is too late for a link that is none, or for valves that PX4 has not."""
+    out = tmp_path / "field.toml"
+    said = "px4 somewhere\npx4\nservo 7\nservo 2\n6 1\n5 1,0\n03\n0,8\n\n12\n5\n"
+    done = CliRunner().invoke(app, ["config", "new", "--out", str(out)], input=said)
+    assert done.exit_code == 0, done.output
+    assert [done.output.count(f"{number}. ") for number in range(1, 7)] == [2, 2, 2, 2, 1, 2]
+    assert "/tmp" not in done.output.partition("written:")[0]
+    assert "PX4 numbers its actuators from 1 to 6" in done.output
+    assert "5 valves 1 m apart cover 5 m" in done.output
+    config = load(out)
+    assert [valve.channel for valve in config.valve] == [2, 3, 4, 5, 6]
+    assert config.nozzle_sets()[0].flow_max_l_min == pytest.approx(4.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "flow_l_min"),
+    [
+        ("0.8", 0.8), ("0,8", 0.8), ("3", 3.0), ("0.8 L/min", 0.8),
+        ("03 at 3 bar", 1.184), ("ISO 03 at 3,0 bar", 1.184), ("03 at 40 psi", 1.136),
+        ("03 @ 300 kPa", 1.184), ("03 at 3bar", 1.184),
+        # The size of ISO 10625 has its point behind the second digit.
+        ("015 at 40 psi", 0.568), ("0067 at 40 psi", 0.254), ("10 at 40 psi", 3.787),
+        ("1.5 at 40 psi", 0.568),
+    ],
+)  # fmt: skip
+def test_a_flow_is_understood_as_people_write_it(text: str, flow_l_min: float) -> None:
+    assert nozzle_flow(text) == pytest.approx(flow_l_min, abs=0.002)
+
+
+@pytest.mark.parametrize("text", ["03", "015", "ISO 03", "iso 3", "blue", "", "nan", "03 at 3"])
+def test_a_size_without_its_pressure_is_no_flow_and_the_forms_are_told(text: str) -> None:
+    with pytest.raises(ConfigError, match="03 at 3 bar, at 40 psi, at 300 kPa") as refused:
+        nozzle_flow(text)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_swath_that_is_not_that_of_the_valves_is_refused(
+    tmp_path: Path, capsys: Captured
+) -> None:
+    out = tmp_path / "field.toml"
+    words = ["config", "new", "--yes", "--out", str(out), "--valves", "4", "--spacing-m", "0.5"]
+    assert execute([*words, "--swath-m", "6"]) == 2
+    assert "4 valves 0.5 m apart cover 2 m" in capsys.readouterr().err
+    assert not out.exists()
+    assert execute([*words, "--swath-m", "2"]) == 0
+    assert [valve.right_m for valve in load(out).valve] == [-0.75, -0.25, 0.25, 0.75]
+    assert execute([*words[:5], "--valves", "1", "--swath-m", "3", "--force"]) == 0
 
 
 BUCKET = """duty,seconds,millilitres,set
