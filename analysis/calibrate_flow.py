@@ -11,7 +11,7 @@ import typer
 
 from analysis.bucket import PULSE, PULSE_FULL_US, BucketCurve, Catch, fit_bucket
 from analysis.csv_rows import Row, TableError, column_names, read_rows
-from analysis.write_back import Write, check_asked, written_lines
+from analysis.write_back import Confirmed, Write, check_asked, check_change, written_lines
 from companion.cli.answer import AsJson, answer, note
 
 if TYPE_CHECKING:
@@ -151,11 +151,13 @@ def pump_flow(
     times: float,
     plot: Path | None,
     is_write: bool,
+    is_confirmed: bool,
     as_json: bool,
 ) -> None:
     """Answer `calibrate flow` for a table of pulse widths."""
     curve = pump_curve_of(csv, times=times)
     result = _pump_result(curve, _range_us(config))
+    check_change(config, result["toml"], is_confirmed=is_confirmed)
     if plot is not None:
         from analysis.calibrate_plots import plot_flow
 
@@ -252,6 +254,7 @@ def flow(
     ] = None,
     plot: Annotated[Path | None, typer.Option(metavar="PNG", help="Picture of the curve.")] = None,
     is_write: Write = False,
+    is_confirmed: Confirmed = False,
     as_json: AsJson = False,
 ) -> None:
     """Fit the flow curve of valves or pump to a bucket test.
@@ -269,11 +272,15 @@ def flow(
     if is_of_a_pump(csv):
         if compare is not None:
             raise TableError(f"--compare {compare}: was measured by duty, {csv} by pulse widths")
-        pump_flow(csv, config=config, times=times, plot=plot, is_write=is_write, as_json=as_json)
+        pump_flow(
+            csv, config=config, times=times, plot=plot, is_write=is_write,
+            is_confirmed=is_confirmed, as_json=as_json,
+        )  # fmt: skip
         return
     names, window = _known(config)
     curves = curves_of(csv, window=window, times=times)
     result = _result(curves, csv, names)
+    check_change(config, result["toml"], is_confirmed=is_confirmed)
     if compare is not None:
         result["compare"] = compared(curves)
         result["warnings"] += [text for each in result["compare"] for text in each["warnings"]]

@@ -27,6 +27,10 @@ _HEADER = re.compile(r"\s*\[(\[?)\s*([A-Za-z0-9_]+)\s*\]")
 _KEY = re.compile(r"\s*([A-Za-z0-9_]+)\s*=")
 # A set with measured points has no published law any more, and what was weighed is new.
 _REPLACED = {"nozzle_set": ("preset", "weighed_duty")}
+# What `config new` guesses, and what stands there once it was measured.
+_GUESS, _MEASURED = "# MEASURE", "# Measured by `vrspray calibrate`"
+# A second taken for a minute is far from this, wear and another nozzle are within it.
+CHANGE_MAX = 2.0
 # What tells the tables of a list apart.
 _NAMED_BY = {"nozzle_set": "valves", "valve": "name"}
 
@@ -34,6 +38,32 @@ _NAMED_BY = {"nozzle_set": "valves", "valve": "name"}
 Write = Annotated[
     bool, typer.Option("--write", help="Put the result into --config; the old file stays as .bak.")
 ]
+
+
+Confirmed = Annotated[
+    bool,
+    typer.Option("--confirm", help="Take flows of over twice, or under half, what --config has."),
+]
+
+
+def check_change(config: Path | None, measured: str, *, is_confirmed: bool) -> None:
+    """Refuse flows that are far from the configured ones, unless that is confirmed."""
+    if config is None or is_confirmed:
+        return
+    load(config)
+    old = tomllib.loads(config.read_text(encoding="utf-8-sig"))
+    for name, given in tomllib.loads(measured).items():
+        for each in given if isinstance(given, list) else [given]:
+            there = old.get(name, {})
+            if isinstance(there, list):
+                key = _NAMED_BY[name]
+                there = next((one for one in there if set(one[key]) == set(each[key])), {})
+            was, now = (max(one.get("flow_l_min", (0.0,))) for one in (there, each))
+            if was > 0.0 and not was / CHANGE_MAX <= now <= was * CHANGE_MAX:
+                raise ConfigError(
+                    f"measured up to {now:.4g} L/min, but {config} has {was:.4g}: look at seconds, "
+                    "units and --times; if it is right, add --confirm"
+                )
 
 
 def check_asked(config: Path | None, *, is_write: bool) -> None:
@@ -62,9 +92,7 @@ def write_back(config: Path, measured: str) -> list[str]:
     before = config.read_text(encoding="utf-8-sig")
     tables = tomllib.loads(measured)
     if "lag" in tables:
-        tables.setdefault("lag", {})["measured_on"] = (
-            datetime.now(tz=UTC).astimezone().date().isoformat()
-        )
+        tables.setdefault("lag", {})["measured_on"] = _today()
     after = _edited(before, tables, config)
     if tomllib.loads(after) != _wanted(tomllib.loads(before), tables, config):
         raise ConfigError(f"{config}: cannot be changed line by line; paste the figures yourself")
@@ -88,6 +116,10 @@ def write_back(config: Path, measured: str) -> list[str]:
             before.splitlines(), after.splitlines(), f"{config}.bak", str(config), lineterm="", n=1
         )
     )
+
+
+def _today() -> str:
+    return datetime.now(tz=UTC).astimezone().date().isoformat()
 
 
 def _wanted(old: dict[str, Any], tables: Mapping[str, Any], config: Path) -> dict[str, Any]:
@@ -157,6 +189,19 @@ def _set(
         found = _span(lines, begin, key)
         if found is not None:
             del lines[found[0] : found[1]]
+    _say_measured(lines, begin, name)
+
+
+def _say_measured(lines: list[str], begin: int, name: str) -> None:
+    """Put what is so now in the place of a comment above a table that called it a guess."""
+    first = begin
+    while first and lines[first - 1].startswith("#"):
+        first -= 1
+    block = lines[first:begin]
+    old = [at for at, line in enumerate(block) if line.startswith((_GUESS, _MEASURED))]
+    if old or name in ("nozzle_set", "pump"):
+        kept = block[: old[0]] if old else block
+        lines[first:begin] = [*kept, f"{_MEASURED}, {_today()}."]
 
 
 def _headers(lines: list[str], name: str) -> Iterator[int]:

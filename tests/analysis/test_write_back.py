@@ -101,3 +101,47 @@ def test_a_calibration_flight_without_a_meter_is_warned_of(
     words = ["calibrate", "mission", "--config", str(EXAMPLE), "--out", str(tmp_path / "c.plan")]
     assert execute(words) == 0
     assert "has no [flow_meter]" in capsys.readouterr().err
+
+
+def bucket(path: Path, seconds: float) -> Path:
+    rows = [(duty, 6000 * duty) for duty in (0.2, 0.4, 0.6, 0.8, 1.0) for _ in range(2)]
+    told = "".join(f"{duty},{seconds:g},{caught:.0f}\n" for duty, caught in rows)
+    path.write_text("duty,seconds,millilitres\n" + told)
+    return path
+
+
+@pytest.mark.parametrize("seconds", [1.0, 60.0 * 2.5])
+@pytest.mark.parametrize("more", [(), ("--write",)])
+def test_a_flow_far_from_the_configured_one_is_refused_until_it_is_confirmed(
+    seconds: float, more: tuple[str, ...], tmp_path: Path, capsys: Captured
+) -> None:
+    path = copy(tmp_path)
+    before = path.read_text()
+    table = bucket(tmp_path / "bucket.csv", seconds)
+    words = ["calibrate", "flow", str(table), "--config", str(path), *more]
+    assert execute(words) == 2
+    told = capsys.readouterr()
+    assert "--confirm" in told.err and "nozzle_set" not in told.out
+    assert path.read_text() == before
+    assert execute([*words, "--confirm"]) == 0
+    assert (path.read_text() != before) is bool(more)
+    path.write_text(before)
+    # What another nozzle or wear do is no mistake.
+    assert execute([*words[:2], str(bucket(table, 50.0)), *words[3:]]) == 0
+
+
+def test_a_comment_that_called_the_figures_a_guess_goes_with_them(tmp_path: Path) -> None:
+    path = tmp_path / "new.toml"
+    assert execute(["config", "new", "--yes", "--out", str(path)]) == 0
+    assert path.read_text().count("# MEASURE") == 2
+    words = ["calibrate", "flow", str(bucket(tmp_path / "a.csv", 60.0)), "--config", str(path)]
+    for _ in range(2):
+        assert execute([*words, "--write"]) == 0
+        text = path.read_text()
+        assert text.count("# MEASURE") == 1
+        assert "0.8 L/min a valve" not in text
+        assert text.count("# Measured by `vrspray calibrate`") == 1
+    write_back(path, LAGS + "off_end_s = 0.3\n")
+    assert "# MEASURE" not in path.read_text()
+    assert "# Valves on outputs of the flight controller" in path.read_text()
+    assert load(path).lag.on_s == 0.2
