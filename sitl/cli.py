@@ -334,6 +334,6 @@ def _print_result(result: dict[str, Any], *, as_json: bool) -> None:
         typer.echo(
             f"lag distance of {lag['count']} changes: mean {lag['mean_abs']:.3f} m, "
             f"worst {lag['max_abs']:.3f} m; {result['metrics']['apart']} apart, "
-            f"{result['metrics']['missed']} missed; off target "
-            f"{result['metrics']['off_target_ml']:.1f} mL"
+            f"{result['metrics']['missed']} missed; "
+            f"{result['metrics']['off_target_ml']:.1f} mL outside the field"
         )
