@@ -214,7 +214,7 @@ def _planned(
         sorties=flights,
         warnings=(
             *range_warnings(sorties.misses, field.frame, settings),
-            *short_warnings(sorties.sorties, rates, field.frame, settings),
+            *short_warnings(sorties.sorties, rates, field.frame, settings, course_deg=angle_deg),
             *crawl_warnings(flights, field.frame, settings),
             *far_warnings(sorties.sorties, places, field, has_battery=settings.battery is not None),
             *near_warnings(sorties.sorties, field.frame, apart=with_sprayer),

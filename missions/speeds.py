@@ -189,20 +189,24 @@ PLACES_MAX = 2_000_000
 # A line with less than this part of the least flow is flown too slowly; worth a word from this part
 # of all lines on.
 CRAWLS, CRAWLED_SHARE = 0.9, 0.05
+# A pass has the plan's course but for rounding.
+ALONG_DEG = 1.0
 # Under every valve while that is a second's work; else under the valve nearest to the middle.
 EVERY_VALVE_MAX = 250_000
 
 
 def short_warnings(
-    sorties: Sequence[Sortie], rates: Rates, frame: LocalFrame, settings: Settings
-) -> tuple[str, ...]:
+    sorties: Sequence[Sortie], rates: Rates, frame: LocalFrame, settings: Settings,
+    *, course_deg: float,
+) -> tuple[str, ...]:  # fmt: skip
     """Return how many cells under a valve are shorter than the lag, and where.
 
-    Not under the middle of the boom: maps that are made for this sprayer have their edges there,
-    between two valves. Of a leg, the valve with the most of them counts.
+    Of the passes along the course: those along the border cross even zones that were made for this
+    sprayer. Not under the middle of the boom: such maps have their edges there, between two
+    valves. Of a leg, the valve with the most of them counts.
     """
     legs = [(sortie.number, leg) for sortie in sorties for leg in sortie.legs
-            if leg.kind == "spray"]  # fmt: skip
+            if leg.kind == "spray" and _is_along(leg, course_deg)]  # fmt: skip
     steps = sum(leg.length_m / max(leg.speed_m_s, 0.1) for _, leg in legs)
     if isinstance(rates, Uniform) or not settings.settle_s > 0.0:
         return ()
@@ -224,12 +228,23 @@ def short_warnings(
         return ()
     length_m, number, leg, at_m = min(found, key=lambda each: each[0] / each[2].speed_m_s)
     place = frame.to_geographic(*between(leg, at_m / leg.length_m))
+    enough_m_s = math.floor(10.0 * length_m / settings.settle_s) / 10.0
+    slower = f"plan with --speed-m-s {enough_m_s:g}, or "
+    slower = slower if enough_m_s >= max(settings.speeds_m_s[0], 0.5) else ""
     return (
         f"{counted(len(found), 'cell')} {'is' if len(found) == 1 else 'are'} flown through in less "
         f"than {settings.settle_s:.2f} s, which a change of rate takes: the shortest is "
         f"{length_m:.1f} m at {leg.speed_m_s:g} m/s, sortie {number} near {place[0]:.6f}, "
-        f"{place[1]:.6f}; fly slower, or make the cells longer",
+        f"{place[1]:.6f}; {slower}make zones of the map that this sprayer follows (vrspray make "
+        "zones)",
     )
+
+
+def _is_along(leg: Leg, course_deg: float) -> bool:
+    """Return whether a line has the course of the passes, to or fro."""
+    (x0, y0), (x1, y1) = leg.points[0], leg.points[-1]
+    off_deg = math.degrees(math.atan2(x1 - x0, y1 - y0)) - course_deg
+    return abs((off_deg + 90.0) % 180.0 - 90.0) <= ALONG_DEG
 
 
 def crawl_warnings(

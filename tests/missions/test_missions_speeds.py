@@ -181,11 +181,20 @@ def test_cells_shorter_than_the_lag_are_named_with_their_place() -> None:
     legs = (Leg(kind="spray", points=((0.0, 0.0), (0.0, 100.0)), speed_m_s=6.0, seconds=20.0),)
     sortie = Sortie(number=3, depot=0, legs=legs)
     fine = Bands((10.0,) * 60 + (20.0,) + (10.0,) * 39)  # one metre of another rate
-    (text,) = short_warnings([sortie], fine, FRAME, settings(settle_s=0.3))
+    (text,) = short_warnings([sortie], fine, FRAME, settings(settle_s=0.3), course_deg=0.0)
     assert text.startswith("1 cell is flown through in less than 0.30 s")
     assert "sortie 3 near 48.000" in text
-    assert short_warnings([sortie], fine, FRAME, settings(settle_s=0.1)) == ()
-    assert short_warnings([sortie], Bands((10.0, 20.0)), FRAME, settings(settle_s=0.3)) == ()
+    assert text.endswith(
+        "; plan with --speed-m-s 2.9, or make zones of the map that this sprayer follows "
+        "(vrspray make zones)"
+    )
+    # A pass along the border, across the zones that were made for the others.
+    assert short_warnings([sortie], fine, FRAME, settings(settle_s=0.3), course_deg=40.0) == ()
+    assert short_warnings([sortie], fine, FRAME, settings(settle_s=0.1), course_deg=0.0) == ()
+    assert (
+        short_warnings([sortie], Bands((10.0, 20.0)), FRAME, settings(settle_s=0.3), course_deg=0.0)
+        == ()
+    )
 
 
 class Beside:
@@ -201,14 +210,16 @@ def test_short_cells_are_those_under_valves_not_under_the_edge_between_two() -> 
     legs = (Leg(kind="spray", points=((0.0, 0.0), (0.0, 100.0)), speed_m_s=6.0, seconds=20.0),)
     sortie = Sortie(number=1, depot=0, legs=legs)
     for valves in (((-1.5, 3.0), (1.5, 3.0)), ((-2.0, 2.0), (0.5, 2.0), (2.0, 2.0))):
-        (text,) = short_warnings([sortie], Beside(), FRAME, settings(settle_s=0.3, valves=valves))
+        (text,) = short_warnings(
+            [sortie], Beside(), FRAME, settings(settle_s=0.3, valves=valves), course_deg=0.0
+        )
         assert text.startswith("1 cell is flown through")
         wide = settings(settle_s=0.15, valves=valves)
-        assert short_warnings([sortie], Beside(), FRAME, wide) == ()
+        assert short_warnings([sortie], Beside(), FRAME, wide, course_deg=0.0) == ()
     back = (Leg(kind="spray", points=((0.0, 100.0), (0.0, 0.0)), speed_m_s=6.0, seconds=20.0),)
     for right_m, count in ((-1.5, 1), (1.5, 0)):
         one = settings(settle_s=0.3, valves=((right_m, 3.0), (3.0 * right_m, 1.0)))
-        turned = short_warnings([replace(sortie, legs=back)], Beside(), FRAME, one)
+        turned = short_warnings([replace(sortie, legs=back)], Beside(), FRAME, one, course_deg=0.0)
         assert len(turned) == count
 
 
