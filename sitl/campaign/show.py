@@ -215,6 +215,9 @@ def differences_of(rows: Rows, by: Sequence[str] = ()) -> list[Group]:
     """Return what each value of the first setting, by default the case, gives beyond the first."""
     setting, *rest = dict.fromkeys(by or ["case"])
     levels, places, _ = _levels(rows, setting)
+    values_of = rows.case if setting == "case" else rows.settings[setting]
+    if not 1 < len(levels) == len(set(values_of)):  # ranges hold several values of one pair
+        return []
     columns = [rows.settings[each.name] for each in rows.campaign.factors if each.name != setting]
     columns += [] if setting == "case" else [rows.case]
     pairs: dict[tuple[Any, ...], int] = {}
