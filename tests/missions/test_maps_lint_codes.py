@@ -15,6 +15,7 @@ SOURCES = [
     *sorted((ROOT / "companion" / "flight_map").rglob("*.py")),
     ROOT / "companion" / "assembly.py",
     ROOT / "companion" / "errors.py",
+    ROOT / "companion" / "wording.py",
 ]
 CODE = re.compile(r"[a-z]+(-[a-z0-9]+)*")
 # `not-a-polygon:Point` is the code and what was found instead.
