@@ -540,7 +540,7 @@ def fly_along(options: AlongOptions, say: Callable[[str], None]) -> dict[str, An
         flights = [
             fly_method(*each) for each in zip(beds, [method] * len(beds), seeds, strict=True)
         ]
-        rows.append(_row(method, [figures_of(*each) for each in zip(beds, flights, strict=True)]))
+        rows.append(row_of(method, [figures_of(*each) for each in zip(beds, flights, strict=True)]))
         records[method] = flights[0].record
         say(f"{method}: {counted(len(flights), 'flight')}")
     bed = beds[0]
@@ -565,7 +565,7 @@ def fly_along(options: AlongOptions, say: Callable[[str], None]) -> dict[str, An
     return result
 
 
-def _row(method: str, flights: list[dict[str, Any]]) -> dict[str, Any]:
+def row_of(method: str, flights: list[dict[str, Any]]) -> dict[str, Any]:
     """Return one method's figures of all flights together."""
 
     def spread(name: str) -> dict[str, float] | None:

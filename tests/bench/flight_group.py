@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sitl.conditions import condition_of
-from tests.bench.flights import FIELD, NOMINAL, PAPER_METHODS, Flown
+from tests.bench.flights import FIELD, NOMINAL, PAPER_METHODS, VEHICLE, Flown
 from tests.bench.sprayers import PLANT
 
 
@@ -58,7 +58,8 @@ class Group:
         one = self.first
         where = "the example's field" if one.condition == FIELD else "hard conditions"
         board = ", free-running board" if one.output == "free-running" else ""
-        return f"{where}, {one.lags} lags{board}"
+        vehicle = ", flown vehicle" if one.plant.endswith(VEHICLE) else ""
+        return f"{where}, {one.lags} lags{board}{vehicle}"
 
     def of_paper(
         self, figure: Callable[[Sequence[Flown]], float | None]

@@ -49,6 +49,9 @@ PINPOINT_SHARE = 2
 PAPER_METHODS = ("none", "look-ahead", "look-ahead-stated")
 OURS, PERFECT = ("gpio", "servo"), "perfect"
 PINPOINT = tuple(f"pinpoint, {case}" for case in (*OURS, PERFECT))
+FLOWN = tuple(f"flown, {case}" for case in (*OURS, PERFECT))
+# Of a sprayer on the vehicle that is fitted to logs of real flights.
+VEHICLE = "-on-flown-vehicle"
 FIELD = "field"
 NOMINAL, IDENTIFIED = "nominal", "identified"
 
@@ -128,6 +131,7 @@ def field_flights(seeds: Iterable[int], *, is_quick: bool) -> list[Flights]:
         _flights(ACCURACY, (*OURS, PERFECT), seeds, {SPEED: slow}),
         _flights(ACCURACY, ("free-running",), seeds, {SPEED: free}),
         _flights(ACCURACY, PAPER_METHODS, seeds, {SPEED: (PAPER_M_S,)}),
+        _flights(ACCURACY, FLOWN, seeds, {SPEED: (PAPER_M_S,)}),
     ]
     # Above the speeds of the paper nothing is held against perfect knowledge.
     return [*found, _flights(ACCURACY, OURS, seeds, {SPEED: fast})] if fast else found
@@ -183,6 +187,8 @@ def _rows(flights: Flights, processes: int, progress: Callable[[], None]) -> lis
     fixed = {**{each.name: each.values[0] for each in campaign.factors}, **campaign.fixed}
     for row in rows:
         assert row["error"] is None, row["error"]
+        if row["case"] in FLOWN:
+            row["plant"] += VEHICLE
     return [{**fixed, **row} for row in rows]
 
 

@@ -272,6 +272,17 @@ def test_one_path_is_flown_by_every_method_and_held_against_perfect_knowledge() 
     assert {"limit_ratio_gpio_5_m_s", "missed_gpio_5_m_s"} <= figures.keys()
 
 
+def test_the_flown_vehicle_is_held_against_perfect_knowledge_on_its_own_path() -> None:
+    cases = ("gpio", "perfect", "flown, gpio", "flown, perfect")
+    flights = Flights(file=ACCURACY, cases=cases, seeds=(3,), values={SPEED: (5.0,)})
+    drawn, on_flown = fly_all([flights], processes=1)
+    assert drawn.perfect_mean_abs_m != on_flown.perfect_mean_abs_m
+    figures = by_key(accuracy([drawn, on_flown], section="a"))
+    lag = figures["lag_wang-2024-on-flown-vehicle_gpio_5_m_s"]
+    assert lag.value == on_flown.mean_abs_m != figures["lag_gpio_5_m_s"].value
+    assert lag.row.endswith(", flown vehicle")
+
+
 def test_a_flight_of_the_bench_is_the_flight_that_its_setup_flies() -> None:
     flights = Flights(
         file=HARD_CONDITIONS,
@@ -332,7 +343,7 @@ def test_a_sprayer_that_is_not_known_is_wrong_both_ways() -> None:
 def test_quick_flies_at_one_speed_only() -> None:
     quick = field_flights(range(1, 4), is_quick=True)
     assert {speed for each in quick for speed in each.values[SPEED]} == {5.0}
-    assert [each.count for each in quick] == [9, 3, 9]
+    assert [each.count for each in quick] == [9, 3, 9, 9]
     full = field_flights(range(1, 21), is_quick=False)
     speeds = {speed for each in full for speed in each.values[SPEED]}
     assert speeds == {2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 15.0}
