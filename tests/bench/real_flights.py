@@ -223,9 +223,9 @@ PAGE_TEXT = """<!-- Written by `python -m tests.bench.real_flights --page`; do n
 
 # Flights that were really flown
 
-`{command}`, {today}. Three flights a row, each over other zones; lag is the median. *Constant* is
-the companion with one filter that holds the acceleration constant. Where a rate has a star the log
-holds fewer positions, and those between know the future.
+`python -m tests.bench.real_flights`, {today}. Three flights a row, each over other zones; lag is
+the median. *Constant* is the companion with one filter that holds the acceleration constant. Where
+a rate has a star the log holds fewer positions, and those between know the future.
 
 {logs}
 
@@ -279,7 +279,7 @@ def page(results: list[dict[str, Any]], plants: list[dict[str, Any]]) -> str:
         for one in plants
     ]
     return PAGE_TEXT.format(
-        **made_by("real_flights"),
+        today=made_by("real_flights")["today"],
         logs="\n".join(logs), bars="\n".join(bars), hidden="\n".join(lines),
     )  # fmt: skip
 

@@ -47,8 +47,8 @@ Perfect knowledge knows each valve.
 
 {closed}
 
-- What the companion does not know of single valves, and that positions come ten times a second,
-  cost more than any error of velocity or place.
+- Not knowing single valves is the largest part of what is misapplied beyond perfect knowledge;
+  errors of velocity, place and nose together are less than half of that.
 - Told the truth 50 times a second the companion still misapplies more than 1.5 times as much as
   perfect knowledge on q130: in turns nobody tells it when the nose will begin to turn. On q116 it
   stays below that once its valves are alike, as after `calibrate valves`.
