@@ -265,4 +265,4 @@ def lines(result: dict[str, Any]) -> Iterator[str]:
     yield f"{result['volume_l']:.1f} L were used"
     yield "paste over the [[nozzle_set]] of these valves, or give --write:"
     yield ""
-    yield result["toml"]
+    yield from result["toml"].splitlines()

@@ -224,7 +224,7 @@ def _pump_lines(result: dict[str, Any]) -> list[str]:
         f"  {point['us']:5.0f}  {point_cells(point, pump['residuals'], by='us')}"
         for point in pump["points"]
     ]
-    return [*lines, "", result["toml"]]
+    return [*lines, "", *result["toml"].splitlines()]
 
 
 # The PWM window that a configuration has unless it says otherwise.
@@ -412,4 +412,4 @@ def _lines(result: dict[str, Any]) -> list[str]:
             f"{_cell(row['eq_2_l_min'], 7, 3)}  {_cell(row['over_eq_2_percent'])}"
             for row in each["rows"]
         ]
-    return [*lines, "", result["toml"]]
+    return [*lines, "", *result["toml"].splitlines()]

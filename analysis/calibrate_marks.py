@@ -217,7 +217,12 @@ def _lines(result: dict[str, Any]) -> list[str]:
         lines.append(_line("boom", errors["body_offset_m"], 1.0, "m ahead of where it is set"))
     lines.append(_line("map", errors["datum_east_m"], 1.0, "m east of the ground"))
     lines.append(_line("map", errors["datum_north_m"], 1.0, "m north of the ground"))
-    return [*lines, "", "# all lines together, or none: they were found together", result["toml"]]
+    return [
+        *lines,
+        "",
+        "# all lines together, or none: they were found together",
+        *result["toml"].splitlines(),
+    ]
 
 
 def _line(name: str, value: dict[str, float], factor: float, text: str) -> str:

@@ -237,4 +237,4 @@ def _lines(result: dict[str, Any]) -> list[str]:
             f"by wind: {fall['value']:+.2f} m for each m/s "
             f"({fall['low']:+.2f} to {fall['high']:+.2f}, 95 %)"
         )
-    return [*lines, "", f"# flown {result['flown']}", result["toml"]]
+    return [*lines, "", f"# flown {result['flown']}", *result["toml"].splitlines()]

@@ -580,7 +580,7 @@ def lines(result: dict[str, Any]) -> Iterator[str]:
         yield f"{result['volume_l']:.1f} L were used"
     yield "paste into the [[valve]] tables of these names, or give --write:"
     yield ""
-    yield result["toml"]
+    yield from result["toml"].splitlines()
 
 
 def _half(figures: dict[str, float]) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -301,13 +302,17 @@ def serve(
     store = Store.at(fleet).existing()
     names = tuple(each.lower() for each in name or ())
     doors = Doors(is_local=is_loopback(host), names=names, port=port)
-    kept = kept_tokens(tokens or Path.home() / ".local/state/vrspray/fleet-tokens.json")
+    tokens = tokens or Path.home() / ".local/state/vrspray/fleet-tokens.json"
+    kept = kept_tokens(tokens)
     guard = Guard(doors=doors, tokens=kept, names_by="--name", printed_by="vrspray fleet serve")
     listener = listen(host, port, port_by="--port", host_by="--host")
     local = "127.0.0.1" if doors.is_local else own_address(host)
     shown = names[0] if names else local
     link = f"http{'s' if tls else ''}://{f'[{shown}]' if ':' in shown else shown}:{port}/"
-    if doors.needs_token:
-        link += f"#token={kept.view}"
-    answer({"fleet": fleet, "url": link}, [f"the fleet's page: {link}"], as_json=as_json)
+    told, lines = link + f"#token={kept.view}" * doors.needs_token, []
+    if not (as_json or sys.stdout.isatty()) and doors.needs_token:
+        # A service's log is read by more people than the page.
+        told, lines = link, [f'its token: "view" in {tokens}']
+    result = {"fleet": fleet, "url": told}
+    answer(result, [f"the fleet's page: {told}", *lines], as_json=as_json)
     serve_page(store, guard, listener, tls)

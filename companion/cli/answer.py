@@ -35,12 +35,17 @@ def answer(result: Mapping[str, Any], lines: Iterable[str], *, as_json: bool) ->
         typer.echo(json.dumps(_finite(result), allow_nan=False))
         return
     for line in lines:
-        typer.echo(line, file=terminal(sys.stdout) if isinstance(line, Styled) else None)
+        typer.echo(_one(line), file=terminal(sys.stdout) if isinstance(line, Styled) else None)
 
 
 def note(line: str) -> None:
     """Print what is not the result, on stderr."""
-    typer.echo(line, err=True)
+    typer.echo(_one(line), err=True)
+
+
+def _one(line: str) -> str:
+    """Return a line as one: a name with an end of line in it begins no line of ours."""
+    return line.replace("\n", "\\n")
 
 
 def problem_line(problem: Mapping[str, Any]) -> str:

@@ -243,4 +243,4 @@ def schema(
     """Print the JSON Schema of the configuration, for editors."""
     del file
     document = Config.model_json_schema(by_alias=True)
-    answer(document, [json.dumps(document, indent=2)], as_json=as_json)
+    answer(document, json.dumps(document, indent=2).splitlines(), as_json=as_json)

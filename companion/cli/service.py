@@ -77,7 +77,7 @@ def install(
     unit = build_unit(config, is_user=user, account=who, is_realtime=realtime)
     path, text = unit_path(is_user=user), unit.text()
     if dry_run:
-        answer({"ok": True, "unit": str(path), "text": text}, [text], as_json=as_json)
+        answer({"ok": True, "unit": str(path), "text": text}, text.splitlines(), as_json=as_json)
         return
     refuse_foreign(path)
     make_folders(unit.writable, account="" if user else who)

@@ -6,6 +6,8 @@ import asyncio
 import csv
 import io
 import json
+import socket
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 import pytest
 
+from analysis.fleet import serving
 from analysis.fleet.asking import asked
 from analysis.fleet.flight_row import recorded
 from analysis.fleet.page import body_of, charts_of
@@ -25,6 +28,7 @@ from companion.web.guard import Doors, Guard, Tokens
 from companion.web.places import Places
 from tests.analysis.fleet_flights import TOLD, copied, damaged, started
 from tests.analysis.report_flight import fly
+from tests.companion.wire_peer import free_port
 
 Captured = pytest.CaptureFixture[str]
 TOKENS = Tokens(view="v" * 43, operate="o" * 43)
@@ -226,6 +230,28 @@ def test_wrong_input_is_refused_in_one_line(
     assert code == 2
     assert text in err
     assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("is_terminal", [False, True])
+def test_the_token_is_on_a_terminal_and_in_no_log(
+    fleet: Path,
+    tmp_path: Path,
+    capsys: Captured,
+    monkeypatch: pytest.MonkeyPatch,
+    is_terminal: bool,
+) -> None:
+    def served(_store: object, _guard: object, listener: socket.socket, _tls: object) -> None:
+        listener.close()
+
+    monkeypatch.setattr(serving, "serve", served)
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: is_terminal)
+    kept, port = tmp_path / "tokens.json", str(free_port(socket.SOCK_STREAM))
+    place = ("--fleet", str(fleet), "--host", "0.0.0.0", "--port", port, "--tokens", str(kept))
+    code, out, _ = run(capsys, "serve", *place)
+    token = json.loads(kept.read_text())["view"]
+    assert code == 0
+    assert (token in out) == is_terminal
+    assert (str(kept) in out) != is_terminal
 
 
 # --------------------------------------------------------------------------------- report

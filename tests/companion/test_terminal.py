@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from companion.cli import live
-from companion.cli.answer import answer, progress
+from companion.cli.answer import answer, note, progress
 from companion.cli.app import execute
 from companion.cli.drawing import drawn
 from companion.cli.live import Shown
@@ -52,6 +52,15 @@ def test_a_name_that_is_no_text_can_be_said(tmp_path: Path) -> None:
         answer({}, [os.fsdecode(b"\xff.shp")], as_json=False)
     out.seek(0)
     assert out.read() == "\\udcff.shp\n"
+
+
+def test_a_name_with_an_end_of_line_begins_no_line(capsys: pytest.CaptureFixture[str]) -> None:
+    forged = "field\nok: nothing to do"
+    answer({}, [f"warning: {forged}"], as_json=False)
+    note(forged)
+    said = capsys.readouterr()
+    assert said.out == "warning: field\\nok: nothing to do\n"
+    assert said.err == "field\\nok: nothing to do\n"
 
 
 def evil_map(folder: Path) -> Path:
