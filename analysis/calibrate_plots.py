@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +9,6 @@ import numpy as np
 
 from analysis.csv_rows import TableError
 from analysis.swath import lanes
-from companion.wording import missing
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -264,8 +262,6 @@ def _axes(path: Path) -> Iterator[Axes]:
 @contextmanager
 def _figure(path: Path, height_in: float = 4.2) -> Iterator[Figure]:
     """Give a figure to draw on, and write it to `path` at the end."""
-    if importlib.util.find_spec("matplotlib") is None:
-        raise TableError(missing("matplotlib"))
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from companion.errors import ConfigError
-from companion.wording import missing
 from sitl.campaign.show import CONFIDENCE, Floats, Group, Index, Rows, shown_value
 
 if TYPE_CHECKING:
@@ -30,14 +29,12 @@ def draw_pictures(
     """Draw what there is to be drawn, and return the files.
 
     Raises:
-        ConfigError: without matplotlib, or where the folder cannot be written.
+        ConfigError: where the folder cannot be written.
     """
-    try:
-        from matplotlib import rc_context
+    from matplotlib import rc_context
 
-        from sitl.demo_pictures import DPI, STYLE
-    except ImportError as error:
-        raise ConfigError(missing("matplotlib", "campaign")) from error
+    from sitl.demo_pictures import DPI, STYLE
+
     with rc_context(STYLE):
         drawn = {
             RESPONSES: _responses(rows, groups),
