@@ -5,6 +5,7 @@ The reference has the true state, takes its acceleration for constant, and is to
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -44,14 +45,14 @@ def made_of(flight: Flight) -> Setup:
     )  # fmt: skip
 
 
-def worse_than_reference_m(flight: Flight, late_s: float) -> float:
+def worse_than_reference_m(flight: Flight, late_s: float, *, noisy: bool = False) -> float:
     """Return by how much more any valve sprayed outside than the reference's."""
-    made, lag = made_of(flight), flight.lag
+    options = FlightOptions(fidelity="averaged", noise=noisy)
+    told_late_s = options.estimator_lag_s if noisy else 0.0
+    lag = replace(flight.lag, position_s=told_late_s)
+    made = made_of(flight._replace(lag=lag))
     said: list[Decision] = []
-    fly(
-        made, flight.flown, PLANT, FlightOptions(fidelity="averaged", noise=False),
-        speed_m_s=5.0, observer=said.append,
-    )  # fmt: skip
+    fly(made, flight.flown, PLANT, options, speed_m_s=5.0, observer=said.append)
     steps_s = np.array([each.now_s for each in said])
     worst_m = 0.0
     for valve, orders in zip(made.boom.valves, executed(said, 6), strict=True):

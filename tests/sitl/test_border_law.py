@@ -26,6 +26,7 @@ MOST_DEG_S = 120.0
 SLOWEST_M_S, FASTEST_M_S = 1.2, 10.0
 # An acceleration is believed within so long; where a closing takes seconds, it counts.
 BELIEVED_S = 0.3
+DECIDED_S = 0.05
 
 
 @st.composite
@@ -97,6 +98,13 @@ def flights(draw: st.DrawFn, *, slowest_s: float) -> Flight:
 def test_valves_spray_no_more_outside_than_who_knows_the_true_state(flight: Flight) -> None:
     if shapely.area(flight.field) > 1.0:
         assert worse_than_reference_m(flight, 0.0) <= MORE_M
+
+
+@FLOWN
+@given(flight=flights(slowest_s=0.15))
+def test_noise_of_the_position_costs_no_more_than_one_decision(flight: Flight) -> None:
+    if shapely.area(flight.field) > 1.0:
+        assert worse_than_reference_m(flight, DECIDED_S, noisy=True) <= MORE_M
 
 
 @FLOWN
