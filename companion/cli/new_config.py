@@ -26,6 +26,8 @@ Ask = Callable[[str, str], str]
 AUTOPILOTS = ("ardupilot", "px4")
 OUTPUTS = ("servo", "gpio")
 GUARDS = ("script", "board", "none")
+# For PX4 until somebody has said that the board is there.
+UNSAID = ""
 _GUARD_LINES = {
     "script": """\
 # ArduPilot's watchdog script closes the valves when this computer loses power; install it
@@ -37,6 +39,11 @@ guard = "auto"
 # test it. The signal moves by dither_us.
 guard = "auto"
 dither_us = 8
+""",
+    UNSAID: """\
+# PX4 has no watchdog script: fit a driver board, test it, and add dither_us = 8. Until then nothing
+# is sprayed.
+guard = "auto"
 """,
     "none": """\
 # Nothing closes the valves when this computer loses power: keep a hand at the pump switch.
@@ -212,7 +219,7 @@ def _with_autopilot(answers: Answers, text: str) -> Answers:
         autopilot="px4" if is_px4 else "ardupilot",
         link=link,
         first_channel=1 if is_px4 else 9,
-        guard="board" if is_px4 else "script",
+        guard=UNSAID if is_px4 else "script",
     )
 
 
@@ -220,7 +227,7 @@ def _with_outputs(answers: Answers, text: str) -> Answers:
     words = text.split()
     kind, *rest = words or [""]
     is_px4 = answers.autopilot == "px4"
-    guards = ("board", "none") if is_px4 else GUARDS
+    guards = (UNSAID, "board", "none") if is_px4 else GUARDS
     guard = rest.pop() if rest and rest[-1] in GUARDS else guards[0]
     if kind not in OUTPUTS or len(rest) > 1:
         raise ConfigError(f"{' '.join(words)!r}: not an output; write servo 9, or gpio 5")
@@ -234,7 +241,7 @@ def _with_outputs(answers: Answers, text: str) -> Answers:
 
 def _outputs(answers: Answers) -> list[str]:
     words = [answers.output, str(answers.first_channel)]
-    return [*words, answers.guard] if answers.output == "servo" else words
+    return [*words, answers.guard] if answers.output == "servo" and answers.guard else words
 
 
 def _with_valves(answers: Answers, text: str) -> Answers:

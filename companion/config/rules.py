@@ -300,7 +300,7 @@ def without_power(config: Document) -> tuple[str, str]:
             "PX4 has no watchdog script, so nothing will be sprayed",
             'fit a driver board and set output.dither_us, or write "none-on-power-loss"',
         )
-    return "without power ArduPilot's watchdog script closes the valves; else nothing sprays", ""
+    return "nothing sprays until ArduPilot's watchdog script is seen: it closes without power", ""
 
 
 def unbounded(config: Document) -> Rule:
