@@ -598,12 +598,12 @@ DEFINITIONS: dict[str, tuple[str, str, str]] = {
     "misapplied_percent": (
         "Misapplied",
         "%",
-        "what the ground got too much and too little, added up, over what was prescribed",
+        "too much and too little under the strips, each pass by itself, over what was prescribed",
     ),
     "border_margin_m": (
         "Border margin",
         "m",
-        "from where the spray ended, or began, to the border; 0 or more: nothing fell outside",
+        "from where the spray ended, or began, to the border; below 0: beyond it",
     ),
     "off_target_ml": ("Outside", "mL", "volume beyond the border or in exclusions"),
     "off_line_ml": ("Off the lines", "mL", "volume in the field, beside the planned lines"),
