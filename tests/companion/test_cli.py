@@ -305,7 +305,7 @@ def test_config_check_accepts_the_example(capsys: Captured) -> None:
     everywhere, guarded, unmetered = found.pop("notes")
     assert (code, found) == (0, {"ok": True, "path": CONFIG, "problems": []})
     assert "the drone sprays the whole map" in everywhere
-    assert "watchdog script closes the valves" in guarded
+    assert "watchdog script is seen" in guarded
     assert "calibrate lag` needs a flow meter" in unmetered
 
 

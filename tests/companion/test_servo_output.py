@@ -183,7 +183,8 @@ async def test_a_dithered_pulse_moves_to_and_fro_while_its_valve_is_open(wire: W
     moved = [pulse for channel, pulse in wire.orders if channel == 9]
     assert moved[:5] == [1504, 1496, 1504, 1496, 1504]
     times_s = [at for at, order in zip(wire.times_s, wire.orders, strict=True) if order[0] == 9]
-    assert times_s[4] - times_s[0] >= 0.39
+    # Four times 0.1 s, of which the first may have left late.
+    assert times_s[4] - times_s[0] >= 0.35
     # The closed one is only refreshed, and stands still.
     assert set(wire.orders) == {(9, 1504), (9, 1496), (10, 1000), (9, 1000)}
 
