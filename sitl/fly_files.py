@@ -181,7 +181,7 @@ def draw(
     axes = figure.subplot_mosaic([["asked", "applied"], ["flow", "flow"]], height_ratios=[3, 1])
     most = max(record.prescription.rates_l_ha) or 1.0
     _draw_asked(record, axes["asked"], most)
-    figure.suptitle(f"SIMULATED: {title}" if title else "SIMULATED")
+    figure.suptitle(f"SIMULATED {title}")
     if title:
         image = _draw_share(record, axes["applied"])
         figure.colorbar(image, ax=axes["applied"], label="% of prescribed", extend="max")
