@@ -64,6 +64,11 @@ def words(pid: int) -> str:
     return ""
 
 
+def readers_of(pid: int) -> list[int]:
+    """Return the processes of a companion that read its map."""
+    return [child for child in children_of(pid) if "map" in words(child).split("\0")]
+
+
 def sockets_of(pid: int) -> int:
     """Return how many sockets a process has open."""
     files = [str(file.readlink()) for file in Path(f"/proc/{pid}/fd").iterdir()]
@@ -274,7 +279,10 @@ async def test_a_new_start_closes_before_it_reads_a_map(config: Path, tmp_path: 
     ):
         try:
             await peer.until(lambda: peer.is_all_closed, within_s=20.0)
-            (reader,) = [pid for pid in children_of(process.pid) if "map" in words(pid).split("\0")]
+            async with asyncio.timeout(20.0):  # the reader of the map comes after
+                while not (readers := readers_of(process.pid)):  # noqa: ASYNC110
+                    await asyncio.sleep(0.02)
+            (reader,) = readers
         finally:
             for pid in (*children_of(process.pid), process.pid):
                 os.kill(pid, signal.SIGKILL)
