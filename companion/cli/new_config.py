@@ -207,6 +207,7 @@ def bucket_curves(csv: str) -> tuple[Mapping[str, Any], ...]:
 def _with_autopilot(answers: Answers, text: str) -> Answers:
     words = text.split()
     name, *rest = words or [""]
+    name = name.lower()
     if name not in AUTOPILOTS or len(rest) > 1:
         raise ConfigError(
             f"{' '.join(words)!r}: not an autopilot; write ardupilot or px4, and then its link, "

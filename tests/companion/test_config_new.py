@@ -50,7 +50,7 @@ def test_what_is_written_passes_the_check(
         ("ardupilot", "servo 9 board", 8, "auto", "driver board closes"),
         ("ardupilot", "servo none", 0, "none-on-power-loss", "nothing closes"),
         ("px4", "servo", 0, "auto", "nothing will be sprayed"),
-        ("px4", "servo 1 board", 8, "auto", "driver board closes"),
+        ("PX4", "servo 1 board", 8, "auto", "driver board closes"),
         ("px4", "servo 1 none", 0, "none-on-power-loss", "nothing closes"),
         ("px4", "gpio 5", 0, "auto", ""),
     ],
