@@ -38,6 +38,8 @@ DO_SET_SERVO, DO_SET_ACTUATOR = 183, 187
 ACTUATORS, AUTOPILOT = 6, 1
 # Signed, it is a stream of its own beside the companion's link 0: neither makes the other's old.
 SIGNED, LINK_NUMBER, STAMPS_PER_S = 1, 1, 100_000
+# Later than all that the companion sent until this was told, and while it was on its way: 0.1 s.
+LEAD = STAMPS_PER_S // 10
 MCL_CURRENT, MCL_FUTURE = 1, 2
 
 
@@ -129,7 +131,7 @@ class Closer:
         if not self._key:
             return found
         since = round((boot_s() - self._told_s) * STAMPS_PER_S)
-        self._stamp = max(self._stamp, self._told["stamp"] + since) + 1
+        self._stamp = max(self._stamp, self._told["stamp"] + since + LEAD) + 1
         found += bytes((LINK_NUMBER,)) + self._stamp.to_bytes(6, "little")
         return found + hashlib.sha256(self._key + found).digest()[:6]
 
