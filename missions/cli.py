@@ -36,6 +36,7 @@ from missions.mix import mix_lines, mix_of, with_tank
 from missions.picture import check_picture, draw_plan
 from missions.pilot_sheet import (
     check_sheet,
+    field_name,
     ground_text,
     parse_start,
     product_of,
@@ -305,8 +306,9 @@ def plan(
         files, marks = write_fleet(planned, out, with_sprayer=sprayer, fences=fences)
     removed = remove_older(out, [*files, *marks])
     stale = stale_warnings(out, lines_before)
+    title = field_name(reading.config) or field.stem
     if png is not None:
-        draw_plan(planned, png, title=field.stem)
+        draw_plan(planned, png, title=title)
     if is_fenced:
         planned = replace(planned, warnings=(*planned.warnings, *fence_warnings(planned, fences)))
     warnings = planned.warnings
@@ -324,7 +326,7 @@ def plan(
     }
     if pilot_sheet is not None:
         write_sheet(
-            planned, result, pilot_sheet, title=field.stem, product=product_of(reading.config),
+            planned, result, pilot_sheet, title=title, product=product_of(reading.config),
             start_min=parse_start(first), picture=png,
         )  # fmt: skip
     warnings = (

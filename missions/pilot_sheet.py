@@ -9,6 +9,7 @@ import base64
 import math
 import re
 from dataclasses import dataclass
+from datetime import datetime
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -74,6 +75,11 @@ def product_of(config: Config | None) -> Product:
     )
 
 
+def field_name(config: Config | None) -> str | None:
+    """Return what the farm calls the field; None where the configuration does not say."""
+    return None if config is None else config.application.field_name
+
+
 def check_sheet(out: Path) -> None:
     """Refuse a sheet whose suffix names no format, before any work."""
     if out.suffix.casefold() not in SUFFIXES:
@@ -119,7 +125,8 @@ def write_sheet(
 ) -> None:
     """Write the sheet of a plan, with the figures of `missions.sheet`; HTML holds its picture."""
     check_sheet(out)
-    facts = _facts(plan, found, product)
+    planned = ("Planned", f"{datetime.now().astimezone():%Y-%m-%d %H:%M}")
+    facts = [planned, *_facts(plan, found, product)]
     tables = [_table(plan, found, product, start_min)]
     notes = _notes(plan, start_min)
     if found.get("mix") is not None:

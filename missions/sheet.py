@@ -289,8 +289,9 @@ def _line(plan: Plan, sortie: Sortie, row: dict[str, Any]) -> str:
         f"sortie {sortie.number:3}  fill to {row['fill_l']:6.2f} L, spray {sortie.volume_l:6.2f} L"
         f"  {row['airborne_s'] / 60.0:5.1f} min from {sortie.start_s / 60.0:.0f} min  "
         f"{counted(sortie.lines, 'line')}, {_speeds(sortie.speeds_m_s)}, "
-        f"{row['items']} of {ITEMS_MAX[plan.settings.autopilot]} items, "
-        f"up to {row['farthest_m']:.0f} m away, {row['overlap_l']:.2f} L twice"
+        f"{row['items']} mission items (the autopilot holds {ITEMS_MAX[plan.settings.autopilot]}), "
+        f"at most {row['farthest_m']:.0f} m from the depot, "
+        f"{row['overlap_l']:.2f} L on ground sprayed before"
     ]
     used_wh = plan.energy_wh(sortie)
     if used_wh is not None:

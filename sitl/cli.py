@@ -333,7 +333,7 @@ def _print_result(result: dict[str, Any], *, as_json: bool) -> None:
     if lag.get("count"):
         typer.echo(
             f"lag distance of {lag['count']} changes: mean {lag['mean_abs']:.3f} m, "
-            f"worst {lag['max_abs']:.3f} m; {result['metrics']['apart']} apart, "
+            f"worst {lag['max_abs']:.3f} m; {result['metrics']['apart']} not measured, "
             f"{result['metrics']['missed']} missed; "
             f"{result['metrics']['off_target_ml']:.1f} mL outside the field"
         )

@@ -112,9 +112,8 @@ def lags_figure(result: DemoResult) -> Figure:
     speeds = result.options.speeds_m_s
     figure = new_figure(
         (10.0, 4.9),
-        "Where the changes of rate fell",
-        "How far past its boundary each change of rate took effect (below 0: too early), a point "
-        "for every boundary and valve",
+        "Where each change of rate took effect",
+        "How far past its boundary (below 0: too early), a point for every boundary and valve",
     )
     left, right = figure.subplots(1, 2, width_ratios=(1.75, 1.0))
     figure.subplots_adjust(left=0.06, right=0.985, top=0.755, bottom=0.075, wspace=0.17)

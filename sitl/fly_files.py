@@ -130,7 +130,7 @@ def fly_lines(result: dict[str, Any]) -> Iterator[str]:
     )
     yield (
         f"lag distance: {_number(lag['mean_abs'])} m mean, {_number(lag['max_abs'])} m worst of "
-        f"{lag['count']} changes; {flight['apart']} apart, {flight['missed']} missed"
+        f"{lag['count']} changes; {flight['apart']} not measured, {flight['missed']} missed"
     )
     ratio = flight["limit_ratio"]
     best = "" if ratio is None else f", {ratio:.2f} times the least possible"
@@ -180,14 +180,15 @@ def draw(
     FigureCanvasAgg(figure)
     axes = figure.subplot_mosaic([["asked", "applied"], ["flow", "flow"]], height_ratios=[3, 1])
     most = max(record.prescription.rates_l_ha) or 1.0
-    _draw_asked(record, axes["asked"], most)
     figure.suptitle(f"SIMULATED {title}")
     if title:
         image = _draw_share(record, axes["applied"])
         figure.colorbar(image, ax=axes["applied"], label="% of prescribed", extend="max")
     else:
         image = _draw_applied(record, axes["applied"], most)
-        figure.colorbar(image, ax=axes["applied"], label="L/ha")
+        figure.colorbar(image, ax=axes["applied"], label="L/ha", extend="max")
+        most = image.norm.vmax
+    _draw_asked(record, axes["asked"], most)
     for name, each in records.items():
         _draw_flow(each, axes["flow"], name)
     if len(records) > 1:
@@ -225,12 +226,16 @@ def _draw_asked(record: FlightRecord, axes: Axes, most_l_ha: float) -> None:
             colour = colormaps["viridis_r"](zone.rate_l_ha / most_l_ha)
             axes.add_patch(PathPatch(outline, facecolor=colour, edgecolor="white", linewidth=0.3))
     axes.plot(record.east_m, record.north_m, color="tab:red", linewidth=0.7)
-    _frame(axes, record, f"prescribed (darkest: {most_l_ha:.1f} L/ha), and the way flown")
+    _frame(axes, record, f"prescribed (darkest: {most_l_ha:.0f} L/ha), and the way flown")
 
 
 def _draw_applied(record: FlightRecord, axes: Axes, most_l_ha: float) -> Any:
-    deposit = _deposit(record, record.volume_ml, 0.25)
-    applied = np.where(deposit.cells_ml > 0.0, deposit.applied_l_ha, np.nan)
+    """Draw what fell; the scale of both maps reaches as far as that."""
+    deposit = _deposit(record, record.volume_ml, 0.5)
+    wet = deposit.cells_ml > 0.0
+    applied = np.where(wet, deposit.applied_l_ha, np.nan)
+    if wet.any():
+        most_l_ha = max(most_l_ha, float(np.percentile(applied[wet], 99.9)))
     _frame(axes, record, "applied")
     return _show(deposit, applied, axes, vmax=most_l_ha, cmap="viridis_r")
 

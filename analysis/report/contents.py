@@ -613,10 +613,9 @@ DEFINITIONS: dict[str, tuple[str, str, str]] = {
         "Volume error", "%", "applied less prescribed volume over the prescribed, where was flown",
     ),
     "apart": (
-        "Apart",
+        "Not measured",
         "changes",
-        "not measured: below 8 %, too close together, at the end of the valves' range, or at the "
-        "border",
+        "below 8 %, too close together, at the end of the valves' range, or at the border",
     ),
     "missed": ("Missed", "changes", "never happened, on and off at borders included"),
 }  # fmt: skip

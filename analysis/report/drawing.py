@@ -105,7 +105,8 @@ def prescribed_and_applied(sheet: Sheet) -> Drawn:
     # One scale for both: the north names one axis of two maps side by side.
     panels[1].set_ylabel("" if not sheet.is_wide else "north [m]")
     panels[0].set_xlabel("" if sheet.is_wide else "east [m]")
-    figure.colorbar(mesh, cax=bar, label="rate [L/ha]")
+    beyond = "max" if np.nanmax(given, initial=0.0) > most else "neither"
+    figure.colorbar(mesh, cax=bar, label="rate [L/ha]", extend=beyond)
     return Drawn(
         name="map",
         title="Prescribed and applied",
@@ -122,15 +123,15 @@ def prescribed_and_applied(sheet: Sheet) -> Drawn:
 def _rates_shown(asked: Floats, given: Floats) -> tuple[float, float]:
     """Return the rates at both ends of the scale; from 0 where the least is not far from it.
 
-    It reaches down to what was applied: ground that got too little is paler than the lowest rate.
+    It reaches as far as what was applied: ground that got too little is paler than the lowest rate,
+    and ground that was sprayed twice is darker than the highest.
     """
     known = asked[np.isfinite(asked) & (asked > 0.0)]
     if not len(known):
         return 0.0, 1.0
-    least, most = (float(each) for each in np.percentile(known, [1.0, 99.9]))
     applied = given[np.isfinite(given) & (given > NOTHING_L_HA) & (asked > 0.0)]
-    if len(applied):
-        least = min(least, float(np.percentile(applied, 1.0)))
+    ends = [np.percentile(each, [1.0, 99.9]) for each in (known, applied) if len(each)]
+    least, most = float(np.min(ends)), float(np.max(ends))
     return (least if 0.5 * most < least < most else 0.0), most
 
 
@@ -184,7 +185,8 @@ def _cells_text(cells: CellMaps) -> str:
 def _mesh(
     panel: Axes, sheet: Sheet, values: Floats, colours: str | Colormap, low: float, high: float
 ) -> QuadMesh:
-    return panel.pcolormesh(
+    """Draw the cells, cut at the border: nothing beyond it is the field's."""
+    mesh = panel.pcolormesh(
         sheet.cells.corner_east_m,
         sheet.cells.corner_north_m,
         np.ma.masked_invalid(values),
@@ -193,6 +195,8 @@ def _mesh(
         vmax=high,
         rasterized=True,
     )
+    mesh.set_clip_path(_path(sheet.flight.setup.prescription.field), panel.transData)
+    return mesh
 
 
 # Lag distances by the rate that a change leads to and by speed, as P1's Fig. 8.
@@ -391,7 +395,9 @@ def _bars(panel: Axes, found: Histogram) -> None:
 def treated_area(sheet: Sheet, treated: Treated) -> Drawn:
     """Draw the treated area over the zones."""
     figure, (panel,), _ = sheet.panels(1, has_bar=False)
-    panel.add_patch(PathPatch(_path(treated), facecolor=SKY, edgecolor="none", rasterized=True))
+    panel.add_patch(
+        PathPatch(_path(treated.area), facecolor=SKY, edgecolor="none", rasterized=True)
+    )
     dress(panel, sheet, f"{treated.area_ha:.4f} ha")
     return Drawn(
         name="treated",
@@ -404,9 +410,9 @@ def treated_area(sheet: Sheet, treated: Treated) -> Drawn:
     )
 
 
-def _path(treated: Treated) -> Path:
+def _path(area: shapely.Geometry) -> Path:
     """Return the area as one path; rings that turn the other way are holes."""
-    parts = shapely.orient_polygons(shapely.get_parts(treated.area))
+    parts = shapely.orient_polygons(shapely.get_parts(area))
     places, codes = [], []
     for ring in shapely.get_rings(parts):
         corners = shapely.get_coordinates(ring)

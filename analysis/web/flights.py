@@ -58,6 +58,7 @@ class Flights:
             "not_now": self.host.flying(),
             "task": self.host.work.task,
             "journals": self.host.journals,
+            "config": self.host.config[1] if self.host.config else "CONFIG",
             "report": self.report,
             **self.listed,
         }

@@ -213,7 +213,7 @@ def table_lines(cards: Sequence[Numbered], method: Method) -> Iterator[str]:
         yield _line(each)
     yield (
         "* use these: corrected for threshold, blur and overlap of drops that fell evenly "
-        f"({LAW}); cover and deposits without it: as P1 counts stains"
+        f"({LAW}); cover and deposits without it: as Wang et al. 2024 count stains"
     )
 
 

@@ -256,7 +256,7 @@ def configuration_checks(config: Config, *, today: date) -> Iterator[Check]:
 
 def refused_configuration(error: ConfigError) -> Check:
     """Return the check of a configuration that cannot be used; its error says what to write."""
-    return fail("configuration", *split_advice(str(error), "see vrspray config check FILE"))
+    return fail("configuration", *split_advice(str(error), "see vrspray config check"))
 
 
 def _agreement(config: Config) -> Check:
@@ -337,14 +337,16 @@ def map_checks(
     config: Config, overrides: Sequence[str] = (), *, now: datetime
 ) -> tuple[list[Check], Setup | None]:
     """Return whether map and boundary can be flown, and what was built of them."""
+    table = config.prescription
+    file = "FILE" if table is None else config.resolve(table.file)
     try:
         flight_map = flight_map_of(config, overrides)
         setup = build_setup(config, flight_map)
     except MapError as error:
-        fix = error.fix or "see vrspray map check FILE"
+        fix = error.fix or f"see vrspray map check {file}"
         return [fail("map", str(error).removesuffix(f"; {error.fix}"), fix), *_no_map()], None
     except ConfigError as error:
-        advice = split_advice(str(error), "see vrspray config check FILE")
+        advice = split_advice(str(error), f"see vrspray config check {config.path}")
         return [fail("map", *advice), *_no_map()], None
     rates = setup.prescription.rates_l_ha
     area_ha = setup.prescription.field.area / 1e4
@@ -373,7 +375,7 @@ def _flight_map(flight_map: FlightMap, now: datetime) -> Check:
     return warn(
         name,
         f"{text}; {counted(len(flight_map.findings), 'finding')}, the first: {first.text}",
-        first.fix or "see vrspray map check FILE",
+        first.fix or f"see vrspray map check {flight_map.source}",
     )
 
 

@@ -326,7 +326,7 @@ def text_of(answers: Answers, *, map_name: str = "") -> str:
 
 
 _HEAD = """
-# Written by `vrspray config new`. Check it after every change: vrspray config check FILE
+# Written by `vrspray config new`. After every change: vrspray config check, with its name
 # All keys: vrspray config schema, or "Configuration keys" in the documentation.
 # What is marked MEASURE is a guess until you have.
 

@@ -125,7 +125,7 @@ def run_companion(
 
     with shown(), screen:
         journal = runtime.execute(flown)
-    kept, line = _kept(journal.path, link)
+    kept, line = _kept(journal, link)
     answer(
         {"journal": kept, "lost_rows": journal.lost, "training": training},
         [line],
@@ -200,7 +200,7 @@ def _new_journal(
     folder = config.resolve(config.journal.folder)
     for line in made_ready(folder):
         note(line)
-    for line in _left_lines(folder, setup, training):
+    for line in _left_lines(config, folder, setup, training):
         note(line)
     return Journal.create(
         folder,
@@ -224,10 +224,12 @@ def _watcher(
     )
 
 
-def _kept(path: Path, link: VehicleLink) -> tuple[str | None, str]:
+def _kept(journal: Journal, link: VehicleLink) -> tuple[str | None, str]:
     """Return the journal, and what is said of it; without anybody heard it is removed."""
+    path = journal.path
     if link.has_been_heard:
-        return str(path), f"journal: {path}"
+        lost = f", without {journal.lost} rows that could not be written" * bool(journal.lost)
+        return str(path), f"journal: {path}{lost}"
     path.unlink(missing_ok=True)
     return None, "no journal is kept: nothing was heard on the link"
 
@@ -252,7 +254,7 @@ def _guard_lines(setup: Setup) -> list[str]:
     return [f"resuming: {area_ha:.3f} ha are already treated; {closes}"]
 
 
-def _left_lines(folder: Path, setup: Setup, training: str) -> list[str]:
+def _left_lines(config: Config, folder: Path, setup: Setup, training: str) -> list[str]:
     """Return that an earlier flight left ground of this map, where nobody goes on from any."""
     if setup.treated is not None or not setup.records_coverage or not folder.is_dir():
         return []
@@ -264,7 +266,7 @@ def _left_lines(folder: Path, setup: Setup, training: str) -> list[str]:
     return [
         f"note: {left.path.name}{left.mark} left {left.left_ha:.2f} ha of this map "
         f"({100.0 * left.left_share:.0f} %); to spray only what is left: "
-        f"vrspray run ... --continue {left.path}"
+        f"vrspray run --config {config.path} --continue {left.path}"
     ]
 
 

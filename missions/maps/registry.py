@@ -339,7 +339,7 @@ def _read(
     if merge is not None or origin is not None:
         raise map_error(
             path,
-            "it is not P2's text map, which alone has points to merge and an origin",
+            "it is no text map, which alone has points to merge and an origin",
             fix="leave out --merge and --origin (prescription.merge, prescription.origin)",
             code="not-a-text-map",
         )

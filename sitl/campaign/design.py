@@ -292,12 +292,14 @@ def _check_settings(found: Campaign) -> None:
             missing = "mission" if "flight.config" in given else "config"
             raise ConfigError(
                 f"flight.{missing}: missing; give flight.config and flight.mission, or neither of "
-                "them for P1's field"
+                "them for the published field (Wang et al. 2024)"
             )
         if "flight.config" in given:
             for name in NOT_OF_FILES:
                 if name in given:
-                    raise ConfigError(f"{name}: on P1's field only; leave it out, or flight.config")
+                    raise ConfigError(
+                        f"{name}: on the published field only; leave it out, or flight.config"
+                    )
         else:
             _refuse_without_effect(given)
         field = given.get("flight.field", P1S_FIELD)
@@ -315,7 +317,7 @@ def _refuse_without_effect(given: Mapping[str, Value]) -> None:
     for name in given:
         for start, fix in NOT_ON_P1S_FIELD.items():
             if name.startswith(start):
-                raise ConfigError(f"{name}: changes nothing over P1's field; {fix}")
+                raise ConfigError(f"{name}: changes nothing over the published field; {fix}")
 
 
 def _check_configuration(found: Campaign) -> None:

@@ -140,3 +140,5 @@ def test_the_scale_of_rates_reaches_down_to_what_was_applied() -> None:
     # A third of the rate along a border is paler than the least that was asked for.
     assert _rates_shown(asked, np.array([5.0, 20.0, 28.0, np.nan, 0.0]))[0] == 0.0
     assert _rates_shown(np.array([np.nan, 0.0]), np.array([np.nan, 0.0])) == (0.0, 1.0)
+    # Ground that was sprayed twice is darker than the largest rate that was asked for.
+    assert _rates_shown(asked, np.array([30.0, 40.0, 56.0, np.nan, 0.0]))[1] > 55.0

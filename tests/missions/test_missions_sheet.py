@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+from datetime import datetime
 from html.parser import HTMLParser
 from itertools import pairwise
 from pathlib import Path
@@ -234,3 +235,21 @@ def test_the_sheet_says_how_little_ways_beside_passes_could_be(
         f"{found['spray_m'] / 1000.0:.1f} km of passes, {beside_km:.1f} km of other ways "
         f"(in any order {found['least_idle_m'] / 1000.0:.1f} km or more)"
     )
+
+
+def test_a_sheet_has_the_fields_own_name_and_the_day_on_which_it_was_planned(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, config: Path
+) -> None:
+    field = written(box(0, 0, 60, 60), tmp_path / "boundary.geojson")
+    days = {datetime.now().astimezone().date().isoformat()}
+    for words, name in (
+        (["--set", 'application.field_name="Long Acre"'], "Long Acre"),
+        ([], "boundary"),
+    ):
+        sheet = tmp_path / "sheet.txt"
+        out = ["--out", tmp_path / "m.kml", "--sheet", sheet]
+        planned(capsys, field, "--config", config, *words, *out)
+        days.add(datetime.now().astimezone().date().isoformat())
+        lines = sheet.read_text().splitlines()
+        assert lines[0] == name
+        assert any(f"Planned        {day} " in line for line in lines for day in days)

@@ -77,7 +77,7 @@ function leftOf(told) {
   }
   if (told.is_open && facts.spares_treated) parts.push(make("p", "In this run: release STOP, enable, and fly the same mission again. Valves stay closed over ground that is treated."));
   const after = make("p", told.is_open ? "After a restart of the companion: " : "The next time the companion starts: ");
-  after.append(make("code", `vrspray run --config … --continue ${state.journals}/${told.file}`));
+  after.append(make("code", `vrspray run --config ${state.config} --continue ${state.journals}/${told.file}`));
   parts.push(after);
   return parts;
 }

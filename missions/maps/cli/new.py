@@ -34,7 +34,7 @@ Force = Annotated[bool, typer.Option("--force", help="Replace an existing file."
 
 
 def grid(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="P2's text map.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Text map of points.")],
     origin: Annotated[
         str | None,
         typer.Option(metavar="LAT,LON,ALT", help="Origin of the plane; default: the first point."),
@@ -51,7 +51,7 @@ def grid(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show the cells of a text map, by P2's equations.
+    """Show the cells of a text map, by the equations of Rovira-Mas et al. 2024.
 
     They are written as points of a CSV file where one is named.
     """

@@ -49,11 +49,11 @@ _FlowSpeed = Annotated[
 ]
 _Merge = Annotated[
     str | None,
-    typer.Option(metavar="HOW", help="P2's text map: max, average or mean of points in a cell."),
+    typer.Option(metavar="HOW", help="Text map: max, average or mean of points in a cell."),
 ]
 _Origin = Annotated[
     str | None,
-    typer.Option(metavar="LAT,LON,ALT", help="P2's text map: origin of its plane; else point 1."),
+    typer.Option(metavar="LAT,LON,ALT", help="Text map: origin of its plane; else point 1."),
 ]
 OverlapPolicy = Annotated[
     str | None,

@@ -69,6 +69,9 @@ async def test_a_flight_is_reported_by_keyboard_and_the_page_is_accessible(
             await page.get_by_role("link", name="Open the report").press("Enter")
         report = await opening.value
         await report.get_by_role("heading", level=1).wait_for()
+        for width in (1280, 390):
+            await report.set_viewport_size({"width": width, "height": 800})
+            assert await report.evaluate("() => document.documentElement.scrollWidth") == width
         await page.locator("#stop").press("Enter")
         await page.get_by_text("stop done").wait_for()
         assert site.orders[-1].name == "stop"
