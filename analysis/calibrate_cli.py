@@ -30,7 +30,6 @@ OTHERS = {
     "flow": Command(target="analysis.calibrate_flow:flow", help=""),
     "valves": Command(target="analysis.calibrate_valves:valves", help=""),
     "curve": Command(target="analysis.calibrate_curve:curve", help=""),
-    "drift": Command(target="analysis.calibrate_drift:drift", help=""),
     "swath": Command(target="analysis.calibrate_swath:swath", help=""),
 }
 MISSION = "sitl.calibration_mission"

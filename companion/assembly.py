@@ -24,7 +24,6 @@ from companion.core.options.flow_trim import FlowTrim
 from companion.core.options.lines import Lines
 from companion.core.options.overlap import OverlapGuard
 from companion.core.options.pump import Pump
-from companion.core.options.valve_tracking import ValveTracking
 from companion.core.setup import Setup
 from companion.core.standing import MOST_M_S2
 from companion.core.types import PwmLimits
@@ -136,7 +135,6 @@ def build_setup(config: Config, flight_map: FlightMap) -> Setup:
         lease_s=config.output.lease_s,
         flow_trim=_flow_trim(config),
         detection=_detection(config),
-        valve_tracking=_valve_tracking(config),
         centres_pulses=config.output.kind == "gpio",
         autopilot_liquid=_autopilot_liquid(config),
         drift=config.drift_law(),
@@ -266,19 +264,6 @@ def _flow_trim(config: Config) -> FlowTrim | None:
         limit=table.limit,
         meter_minimum_l_min=table.meter_minimum_l_min,
         settle_s=table.settle_s,
-    )
-
-
-def _valve_tracking(config: Config) -> ValveTracking | None:
-    """Return how each valve's flow is tracked in flight, if it is to be."""
-    table = config.valve_tracking
-    if not table.enabled:
-        return None
-    return ValveTracking(
-        limit=table.limit,
-        tau_s=table.tau_s,
-        meter_delay_s=table.meter_delay_s,
-        meter_minimum_l_min=config.flow_trim.meter_minimum_l_min,
     )
 
 

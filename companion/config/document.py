@@ -45,7 +45,6 @@ class Document(tables.Table):
     application: application_table.ApplicationTable = application_table.ApplicationTable()
     limits_table: tables.LimitsTable = Field(default=tables.LimitsTable(), alias="limits")
     flow_trim: tables.FlowTrimTable = tables.FlowTrimTable()
-    valve_tracking: tables.ValveTrackingTable = tables.ValveTrackingTable()
     flow_meter: sprayer_tables.FlowMeterTable = sprayer_tables.FlowMeterTable()
     pressure: sprayer_tables.PressureTable = sprayer_tables.PressureTable()
     tank: sprayer_tables.TankTable = sprayer_tables.TankTable()
@@ -104,12 +103,6 @@ class Document(tables.Table):
     def makes_flow(self) -> bool:
         """Whether a pump's speed makes the flow, and valves are on-off sections."""
         return self.pump is not None and self.pump.control == "modulates"
-
-    @property
-    def can_track_valves(self) -> bool:
-        """Whether a meter that is read here can tell valves apart that are dosed one by one."""
-        sets, is_read = self.nozzle_set, self.flow_meter.source == "gpio"
-        return is_read and not self.makes_flow and len(sets) == 1 and len(sets[0].valves) > 1
 
     @property
     def planned_lines(self) -> str | None:

@@ -33,7 +33,7 @@ SPAN_MIN_US = 100
 # Passes spaced by another width than the flow law's leave skips or overlaps in every pass.
 SWATH_TOLERANCE = 0.02
 # Where none of these is written there is nothing of sensors that could contradict anything.
-_SENSOR_TABLES = frozenset({"flow_meter", "pressure", "tank", "detection", "valve_tracking"})
+_SENSOR_TABLES = frozenset({"flow_meter", "pressure", "tank", "detection"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

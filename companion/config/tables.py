@@ -520,24 +520,6 @@ class FlowTrimTable(Table):
     )
 
 
-class ValveTrackingTable(Table):
-    """Each valve's flow against the others', tracked in flight; see calibrate-valves.md."""
-
-    enabled: bool = Field(
-        default=False,
-        description="true: needs a flow meter on GPIO; valves are dosed by what it shows of each",
-    )
-    limit: float = Field(
-        default=0.10, ge=0.01, le=0.2, description="largest change of a valve's flow factor"
-    )
-    tau_s: float = Field(
-        default=3600.0, ge=60, le=36_000, description="what was learned fades with this time"
-    )
-    meter_delay_s: float = Field(
-        default=0.001, ge=0, le=1, description="from the flow to the meter's count"
-    )
-
-
 class DriftTable(Table):
     """Where droplets land beside their nozzle; see howto/wind-and-drift.md."""
 

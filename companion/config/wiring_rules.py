@@ -90,9 +90,6 @@ def sensor_contradictions(config: Document, capacity_l: float | None) -> Found:
             "detection.enabled",
             'needs a flow meter to detect faults; set flow_meter.source = "gpio", or write false',
         )
-    if config.valve_tracking.enabled and not config.can_track_valves:
-        why = 'needs flow_meter.source = "gpio" and one nozzle set of valves dosed one by one'
-        yield "valve_tracking.enabled", f"{why}; or write false"
 
 
 def _meter(config: Document) -> Found:

@@ -17,6 +17,11 @@ from pydantic_core import ErrorDetails
 from companion.errors import Problem
 from companion.wording import show_value
 
+# Tables that were read once, and what to write instead.
+_GONE = {
+    "valve_tracking": "valves are no longer tracked in flight: delete the table, and measure each "
+    "valve with `vrspray calibrate valves`"
+}
 BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 WRONG = {
@@ -191,6 +196,8 @@ def _schema_at(steps: Sequence[str | int], schema: dict[str, Any]) -> dict[str, 
 
 
 def _nearest(steps: Sequence[str | int], schema: dict[str, Any]) -> str:
+    if steps[-1] in _GONE:
+        return _GONE[str(steps[-1])]
     known = list(_schema_at(steps[:-1], schema).get("properties", {}))
     near = difflib.get_close_matches(str(steps[-1]), known, n=1, cutoff=0.5)
     if near:

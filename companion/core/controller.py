@@ -39,7 +39,7 @@ from companion.core.nozzle import (
     skew_of,
     speed_soon,
 )
-from companion.core.options import flow_trim, treated_area, valve_tracking
+from companion.core.options import flow_trim, treated_area
 from companion.core.options.atomisers import flows_ahead, spinning
 from companion.core.options.coverage import Coverage
 from companion.core.options.drift import is_same, landed, offset
@@ -55,7 +55,6 @@ from companion.core.options.pump import (
     sections,
 )
 from companion.core.options.treated_area import TreatedArea
-from companion.core.options.valve_tracking import TrackMemory
 from companion.core.safety import (
     NUMBER_MAX,
     UNASKED,
@@ -95,14 +94,12 @@ if TYPE_CHECKING:
 class Watched(NamedTuple):
     """What came of the plans so far: faults of the liquid, and the ground that was treated.
 
-    `ran_s` is when something was last to flow, where a motor wants to know; `track` is how far
-    single valves have drifted.
+    `ran_s` is when something was last to flow, where a motor wants to know.
     """
 
     watch: WatchMemory | None = None
     area: TreatedArea | None = None
     ran_s: float = -math.inf
-    track: TrackMemory | None = None
 
 
 class Ordering(NamedTuple):
@@ -207,7 +204,7 @@ def _watch(
     now_s: float,
 ) -> Watched:
     """Return what flow, pressure and tank say of the plan until now, and what it treated."""
-    watch, area, ran_s, track = before
+    watch, area, ran_s = before
     if setup.watching is not None:
         # With the set-up it was loaded: here it is only looked up.
         from companion.core.options.liquid_faults import follow
@@ -222,10 +219,7 @@ def _watch(
     has_motors = setup.pump is not None or bool(setup.atomisers)
     if has_motors and liquid is not None and any(liquid.duty_at(now_s)):
         ran_s = now_s
-    if setup.tracking is not None:
-        report = None if state is None else state.flow
-        track = valve_tracking.follow(setup.tracking, track, plan, report, now_s=now_s)
-    return Watched(watch, area, ran_s, track)
+    return Watched(watch, area, ran_s)
 
 
 def _settled(watched: Watched, now_s: float, *, is_busy: bool) -> Watched:
@@ -234,17 +228,6 @@ def _settled(watched: Watched, now_s: float, *, is_busy: bool) -> Watched:
     if area is None or area.unstamped is None or (is_busy and area.may_wait(now_s)):
         return watched
     return watched._replace(area=area.settled())
-
-
-def _nozzles(setup: Setup, watched: Watched) -> tuple[NozzleSet, ...]:
-    """Return the nozzle sets, with the shares of the valves as they are known now."""
-    return setup.nozzle_sets if watched.track is None else (watched.track.nozzles,)
-
-
-def _all_findings(setup: Setup, watched: Watched) -> tuple[Finding, ...]:
-    """Return what is wrong with the liquid, and the valves that have drifted."""
-    found = _findings(setup, watched.watch)
-    return found if watched.track is None else found + watched.track.findings
 
 
 def _findings(setup: Setup, watch: WatchMemory | None) -> tuple[Finding, ...]:
@@ -301,7 +284,7 @@ def _closed(
         flow_l_min=0.0,
         flow_trim=None if trim is None else trim.sets[trim.set_index].trim,
         flow_trim_state=None if trim is None else trim.state,
-        findings=_all_findings(setup, watched),
+        findings=_findings(setup, watched.watch),
         sprayer=shown(permission.sprayer, is_open=False),
     )
     return decision, Memory(
@@ -403,8 +386,7 @@ def _orders(
     dosing: Sequence[Dosing] = (on_off,) * len(in_force)
     is_early, own_routes = False, routes
     if setup.pumping is None:
-        sets = _nozzles(setup, watched)
-        dosing = dosing_by_valve(sets, index, set_of_rate, dose, count=len(in_force))
+        dosing = dosing_by_valve(setup.nozzle_sets, index, set_of_rate, dose, count=len(in_force))
     else:
         own_routes, is_early = sections(
             setup.pumping, routes, ran_s=watched.ran_s, was_early=before.is_early, now_s=now_s
@@ -666,8 +648,7 @@ def _decision(
     known = {rate: flow_of(rate or 0.0) for rate in set(rates)}
     flows = [known[rates[valve]] for valve in nozzles.valves]
     too_much = {flow for flow in known.values() if not nozzles.curve.delivers(flow)}
-    sets = setup.doses.nozzle_sets if watched.track is None else _nozzles(setup, watched)
-    flow_l_min = _flow(setup, plan, sets[index])
+    flow_l_min = _flow(setup, plan, setup.doses.nozzle_sets[index])
     if setup.trimming is not None and trim is not None:
         trim = flow_trim.ordered(
             setup.trimming, trim, flow_l_min=flow_l_min, index=index, now_s=now_s
@@ -684,7 +665,7 @@ def _decision(
         unresolved_count=sum([valve.unresolved_count for valve in orders.valves]),
         flow_trim=None if trim is None else trim.sets[index].trim,
         flow_trim_state=None if trim is None else trim.state,
-        findings=_all_findings(setup, watched),
+        findings=_findings(setup, watched.watch),
         sprayer=shown(permission.sprayer, is_open=plan.opens),
         out_of_range_count=sum([flow in too_much for flow in flows]) if too_much else 0,
     )

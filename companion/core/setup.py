@@ -18,7 +18,6 @@ from companion.core.options.lines import Lines
 from companion.core.options.overlap import OverlapGuard
 from companion.core.options.pump import Pump, Pumping
 from companion.core.options.treated_area import Lags, TreatedAreaSettings
-from companion.core.options.valve_tracking import Tracking, ValveTracking
 from companion.core.prescription import Prescription
 from companion.core.safety import Limits
 from companion.core.schedule import LagModel, Timing
@@ -56,7 +55,6 @@ class Setup:
     overlap: OverlapGuard | None = None  # None: treated ground is sprayed again
     # What earlier flights treated; not compared by hash: tiles are a mapping.
     treated: Coverage | None = field(default=None, repr=False, hash=False)
-    valve_tracking: ValveTracking | None = None  # None: valves stay as configured
     # The output opens a valve with a new period, the pulse in its middle: our own engine does.
     centres_pulses: bool = False
     most_m_s2: float = MOST_M_S2  # the vehicle's acceleration
@@ -77,7 +75,6 @@ class Setup:
     pumping: Pumping | None = field(init=False, repr=False, compare=False)
     trimming: Trimming | None = field(init=False, repr=False, compare=False)
     watching: Watching | None = field(init=False, repr=False, compare=False)
-    tracking: Tracking | None = field(init=False, repr=False, compare=False)
     recording: TreatedAreaSettings | None = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -123,7 +120,6 @@ class Setup:
 
             watching = Watching.of(self.detection, doses.nozzle_sets, doses.lag, doses.pwm)
         object.__setattr__(self, "watching", watching)
-        object.__setattr__(self, "tracking", self._tracking())
         object.__setattr__(self, "recording", self._recording() if self.records_coverage else None)
 
     def _guarded(self) -> Prescription | None:
@@ -148,13 +144,6 @@ class Setup:
             is_pumped=self.pumping is not None,
             treated=self.treated,
         )
-
-    def _tracking(self) -> Tracking | None:
-        if self.valve_tracking is None:
-            return None
-        if self.pumping is not None:
-            raise ValueError("where a pump makes the flow no valve is dosed by itself")
-        return Tracking.of(self.valve_tracking, self.boom, self.nozzle_sets, self.lag, self.pwm)
 
     def _pumping(self) -> Pumping | None:
         if self.pump is None:

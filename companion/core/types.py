@@ -406,7 +406,7 @@ class FaultKind(StrEnum):
     METER_FAULT = "meter-fault"  # the meter says so itself, or is silent
     PRESSURE_FAULT = "pressure-fault"
     TANK_FAULT = "tank-fault"
-    VALVE_DRIFT = "valve-drift"  # one valve gives more or less than the others
+    VALVE_DRIFT = "valve-drift"  # in older journals only
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

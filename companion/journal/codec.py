@@ -150,6 +150,8 @@ def decode(text: str, field_names: FieldNames = FIELD_NAMES) -> object:
 SETUP_VERSION = 1
 # In tables of their own: the ground as layers, what earlier flights treated as tiles.
 _APART = frozenset({"prescription", "treated"})
+# Of older journals: an option that moved doses, where it was on, by the flow of single valves.
+_GONE = "valve_tracking"
 
 
 def setup_to_json(setup: Setup) -> str:
@@ -196,7 +198,9 @@ def setup_from_json(text: str, ground: Ground) -> Setup:
             raise ValueError(f"set-up of version {document['version']}")
         names: FieldNames = document["fields"]
         values: dict[str, Any] = {
-            key: from_plain(value, names) for key, value in document["setup"].items()
+            key: from_plain(value, names)
+            for key, value in document["setup"].items()
+            if key != _GONE
         }
         about = document["prescription"]
         overlap: Overlap = about["overlap"]

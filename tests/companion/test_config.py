@@ -221,6 +221,7 @@ def test_what_must_be_measured_has_no_default(key: str) -> None:
 REFUSED = [
     ("lag.onn_s=0.1", "lag.onn_s = 0.1: unknown key; did you mean lag.on_s?"),
     ("prescripton.file=x", "unknown key; did you mean prescription?"),
+    ("valve_tracking.enabled=false", "unknown key; valves are no longer tracked in flight: delete"),
     ("valve[2].rihgt_m=1", "did you mean valve[2].right_m?"),
     ("lag.on_s=fast", 'lag.on_s = "fast": not a number; write a number from 0 to 30'),
     ('boom.width_m="6.0"', 'boom.width_m = "6.0": not a number'),

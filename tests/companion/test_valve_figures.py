@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from datetime import date
@@ -199,7 +200,11 @@ def test_a_journal_keeps_them_to_the_bit() -> None:
         field=written.prescription.field,
         cells=None,
     )
-    read = setup_from_json(setup_to_json(written), ground)
+    text = setup_to_json(written)
+    older = json.loads(text)
+    older["setup"]["valve_tracking"] = {"ValveTracking": [0.1, 3600.0, 0.001, 0.5]}
+    assert setup_from_json(json.dumps(older), ground).nozzle_sets == written.nozzle_sets
+    read = setup_from_json(text, ground)
     assert read.boom.valves == written.boom.valves
     assert read.nozzle_sets == written.nozzle_sets
     assert read.timings == written.timings
