@@ -253,7 +253,8 @@ def _waypoints(path: Path, text: str) -> MissionFile:
     lines = text.splitlines()
     if not lines or lines[0].strip() != HEADER:
         raise UploadError(f"{path}: not a mission: its first line is not {HEADER!r}")
-    items = []
+    items: list[WireItem] = []
+    row = None
     for number, line in enumerate(lines[1:], start=2):
         columns = line.split()
         if not columns:
@@ -261,6 +262,7 @@ def _waypoints(path: Path, text: str) -> MissionFile:
         try:
             if len(columns) != COLUMNS:
                 raise ValueError(f"{COLUMNS} columns are needed, there are {len(columns)}")
+            row = _next_row(int(columns[0]), row)
             items.append(
                 wire_item(
                     int(columns[3]), int(columns[2]), [float(each) for each in columns[4:11]],
@@ -269,9 +271,26 @@ def _waypoints(path: Path, text: str) -> MissionFile:
             )  # fmt: skip
         except ValueError as error:
             raise UploadError(f"{path}: line {number}: {error}") from error
-    if not items:
+    if row is None:
         raise UploadError(f"{path}: there are no items in it")
-    return MissionFile(path=path, home=items[0], items=tuple(items[1:]))
+    if row == len(items):  # rows from 1 on: it has no home, and the vehicle sets its own
+        near = next((item for item in items if item.x or item.y), items[0])
+        home = wire_item(WAYPOINT, GLOBAL, [0.0] * 4 + [near.x / 1e7, near.y / 1e7, 0.0])
+        return MissionFile(path=path, home=home, items=tuple(items))
+    home = items.pop(0)
+    if (home.command, home.frame) != (WAYPOINT, GLOBAL):
+        raise UploadError(
+            f"{path}: row 0 is home, and here it is command {home.command} in frame {home.frame}; "
+            f"put a row of home ({WAYPOINT} in frame {GLOBAL}) before it, or number the rows from 1"
+        )
+    return MissionFile(path=path, home=home, items=tuple(items))
+
+
+def _next_row(row: int, before: int | None) -> int:
+    """Return the row's number: 0 is home, a file without begins with 1, and none is left out."""
+    if row not in ((0, 1) if before is None else (before + 1,)):
+        raise ValueError(f"row {row} follows {'the head' if before is None else f'row {before}'}")
+    return row
 
 
 def _plan(path: Path, text: str) -> MissionFile:

@@ -238,15 +238,19 @@ def _waypoint_items(path: Path, text: str) -> tuple[MissionItem, ...]:
     lines = text.splitlines()
     if not lines or lines[0].strip() != _HEADER:
         raise ConfigError(f"{path}: first line must be '{_HEADER}' (or name the file .plan)")
-    items = []
+    items: list[MissionItem] = []
     for number, line in enumerate(lines[1:], start=2):
         fields = line.split()
         if not fields:
             continue
         try:
+            if not items and fields[0] != "0":
+                raise ValueError("row 0, home, is missing; write the file with it")
             items.append(_waypoint_item(fields))
         except (ValueError, OverflowError) as error:
             raise ConfigError(f"{path}: line {number}: {error}") from error
+    if items and items[0].command != dialect.MAV_CMD_NAV_WAYPOINT:
+        raise ConfigError(f"{path}: row 0 is home, and here it is command {items[0].command}")
     return tuple(items)
 
 

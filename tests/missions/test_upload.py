@@ -50,6 +50,10 @@ CORNERS = tuple(
 )
 FILE = MissionFile(path=Path("m.plan"), home=HOME, items=ITEMS, fence=CORNERS)
 
+# Two rows of a `.waypoints` file behind index and "current".
+TAKES_OFF = "3 22 0 0 0 0 48.0001 11.0001 3.5 1\n"
+GOES = "3 16 0 0 0 0 48.0002 11.0002 3.5 1\n"
+
 
 def plan_file(tmp_path: Path, **changes: Any) -> Path:
     simple = {"type": "SimpleItem", "command": 16, "frame": 3, "autoContinue": True,
@@ -118,6 +122,11 @@ def test_a_wrong_plan_is_refused_with_the_place(
         ("m.waypoints", "QGC WPL 110\n", "no items"),
         ("m.waypoints", "QGC WPL 110\n0 1 0 16 0\n", "line 2: 12 columns are needed, there are 5"),
         ("m.waypoints", "QGC WPL 110\n0 1 0 16 0 0 0 0 1 2 nil 1\n", "line 2: could not convert"),
+        ("m.waypoints", f"QGC WPL 110\n0 1 {TAKES_OFF}1 0 {GOES}", "row 0 is home, and here it is"),
+        ("m.waypoints", f"QGC WPL 110\n0 1 {GOES}1 0 {GOES}", "command 16 in frame 3"),
+        ("m.waypoints", f"QGC WPL 110\n2 0 {GOES}", "line 2: row 2 follows the head"),
+        ("m.waypoints", f"QGC WPL 110\n1 0 {GOES}3 0 {GOES}", "line 3: row 3 follows row 1"),
+        ("m.waypoints", f"QGC WPL 110\n1 0 {GOES}0 0 {GOES}", "line 3: row 0 follows row 1"),
     ],
 )
 def test_a_wrong_file_is_one_line_and_exit_2(
@@ -129,6 +138,17 @@ def test_a_wrong_file_is_one_line_and_exit_2(
     out, err = capsys.readouterr()
     assert says in json.loads(out)["error"]
     assert len(err.splitlines()) == 1
+
+
+def test_a_file_that_has_no_home_loses_no_item(tmp_path: Path) -> None:
+    """Its rows begin with 1: the first is no home, and a take-off stays one."""
+    path = tmp_path / "m.waypoints"
+    path.write_text(f"QGC WPL 110\n1 0 {TAKES_OFF}2 0 {GOES}")
+    found = read_mission_file(path)
+    assert [item.command for item in found.items] == [22, 16]
+    assert found.home == WireItem(command=16, frame=0, x=480_001_000, y=110_001_000)
+    assert [item.command for item in found.items_for("ardupilot")] == [16, 22, 16]
+    assert [item.command for item in found.items_for("px4")] == [22, 16]
 
 
 def test_a_mission_and_a_device_that_are_not_there_are_refused_with_what_to_do(

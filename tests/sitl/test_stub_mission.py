@@ -191,6 +191,8 @@ def test_a_mission_that_is_not_there_is_said_to_be_missing(tmp_path: Path) -> No
         ("a.waypoints", "QGC WPL 110\n0 1 0 16\n", "line 2: 12 columns"),
         ("a.waypoints", "QGC WPL 110\n0 1 0 x 0 0 0 0 0 0 0 1\n", "line 2"),
         ("a.waypoints", "QGC WPL 110\n", "no mission items"),
+        ("a.waypoints", "QGC WPL 110\n1 0 3 22 0 0 0 0 48 11 3 1\n", "line 2: row 0, home"),
+        ("a.waypoints", "QGC WPL 110\n0 1 3 22 0 0 0 0 48 11 3 1\n", "here it is command 22"),
         ("a.plan", "{", "not a QGroundControl plan"),
         ("a.plan", "{}", "mission"),
     ],

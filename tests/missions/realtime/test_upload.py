@@ -183,7 +183,7 @@ async def test_the_item_that_the_vehicle_refuses_is_named(autopilot: str, tmp_pa
 async def test_a_mission_with_too_many_items_is_refused_by_the_vehicle(tmp_path: Path) -> None:
     file = tmp_path / "m.waypoints"
     row = "{}\t0\t3\t16\t0\t0\t0\t0\t48.0\t11.0\t3.5\t1"
-    file.write_text("\n".join(["QGC WPL 110", *(row.format(n) for n in range(2002))]) + "\n")
+    file.write_text("\n".join(["QGC WPL 110", *(row.format(n) for n in range(1, 2002))]) + "\n")
     async with stub_on_a_port("px4") as (_, url):
         with pytest.raises(UploadError, match="no room for 2001 items"):
             await upload(file, url)
