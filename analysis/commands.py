@@ -41,6 +41,10 @@ FLIGHTS_REMAINING = Command(
     target="analysis.journals.cli:REMAINING",
     help="Show what is treated, what is left in hectares and litres, and where to resume.",
 )
+FLIGHTS_JOB = Command(
+    target="analysis.journals.cli:JOB",
+    help="List the sorties of a job, for one report of all.",
+)
 FLIGHTS_RECOVER = Command(
     target="analysis.journals.cli:RECOVER",
     help="Repair journals after a crash or power cut.",

@@ -2,7 +2,8 @@
 
 Numpy and shapely only, and nothing of the product: path, strips and volumes come from the truth
 file, ground from GeoJSON. Areas are exact polygons of what open valves swept; doses are sums of
-drops over a fine raster. Ground is treated where a valve gives half of what it gives while open.
+drops over a fine raster. Ground is treated where a valve gives half of what it gives while open:
+per metre, as a slow start with little flow treats its ground like any other.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ Bools = NDArray[np.bool_]
 OPEN_FROM = 0.5
 # Pulses are no openings: flows are means over about a period.
 MEAN_S = 0.09
+SLOWEST_M_S = 0.2
 FINE_M = 0.05
 PARTS = 4
 PER_L_HA = 10.0  # mL/m2 to L/ha
@@ -166,11 +168,14 @@ def flows_of(truth: Truth) -> Floats:
 def openings_of(truth: Truth) -> list[Any]:
     """Return the ground of each time that a valve was open."""
     flow, found = flows_of(truth), []
+    step_s = float(np.median(np.diff(truth.time_s)))
     for valve in range(flow.shape[1]):
         its = flow[:, valve]
         if not (its > 1e-6).any():
             continue
         left, right = truth.sides(valve)
+        speed = np.hypot(*np.diff(0.5 * (left + right), axis=0).T) / step_s
+        its = its / np.maximum(speed, SLOWEST_M_S)
         runs = np.flatnonzero(np.diff(its > 1e-6, prepend=False, append=False))
         for first, end in zip(runs[::2], runs[1::2], strict=True):
             # What is half of the usual is by what flows around it: a rate may be half of another.

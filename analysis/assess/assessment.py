@@ -27,7 +27,7 @@ from analysis.assess.causes import Causes, causes_of
 from analysis.assess.cell_maps import CellMaps, cell_maps
 from analysis.assess.ground import Ground, Treated, ground_of, treated_of
 from analysis.dose import flow_samples, misapplied_parts
-from analysis.evaluation import Changes, Evaluation, changes_of, evaluate_strips
+from analysis.evaluation import Changes, Distances, Evaluation, changes_of, evaluate_strips
 from analysis.flown.applied_record import STEP_S, Source, modelled_ml, record_of
 from analysis.flown.holes import GAP_S
 from analysis.flown.modelled_flow import metered_l, ordered_s
@@ -78,16 +78,25 @@ class Worst:
         }
 
 
-def worst_of(flight: AppliedFlight, steps: Sequence[Step]) -> Worst:
+def worst_of(
+    flight: AppliedFlight,
+    steps: Sequence[Step],
+    *,
+    also: Sequence[tuple[AppliedFlight, Sequence[Step]]] = (),
+) -> Worst:
     """Return how far off the worst measured change may lie; borders are not among them."""
     measured = [
-        step for step in steps if step.lag_distance_m is not None and not step.change.border
+        (step, each)
+        for each, its in ((flight, steps), *also)
+        for step in its
+        if step.lag_distance_m is not None and not step.change.border
     ]
-    why_not = _why_not(flight, len(measured))
+    flights = [flight, *(each for each, _ in also)]
+    why_not = next(filter(None, (_why_not(each, len(measured)) for each in flights)), "")
     if why_not:
         return Worst(bound_m=None, why_not=why_not, count=len(measured))
-    lag_m = np.array([step.lag_distance_m for step in measured], dtype=np.float64)
-    sd_m = np.array([uncertainty_m(step, flight.setup.lag) for step in measured])
+    lag_m = np.array([step.lag_distance_m for step, _ in measured], dtype=np.float64)
+    sd_m = np.array([uncertainty_m(step, each.setup.lag) for step, each in measured])
     return Worst(bound_m=bound_m(lag_m, sd_m), why_not="", count=len(measured))
 
 
@@ -181,13 +190,30 @@ class Balance:
 
 def balance_of(flight: AppliedFlight, model_ml: float, asked_l: float) -> Balance:
     """Return the balance of a flight whose model put out `model_ml` where `asked_l` were asked."""
-    model_l = model_ml / ML_PER_L
-    meter_l = metered_l(flight)
     start_l, end_l, refilled_l = _tank(flight)
     tank_l = None
     if start_l is not None and end_l is not None and refilled_l is not None:
         tank_l = start_l + refilled_l - end_l
     detection = flight.setup.detection
+    return _balance(
+        asked_l,
+        model_ml / ML_PER_L,
+        metered_l(flight),
+        tank_l,
+        None if detection is None else 100.0 * detection.spread,
+        (start_l, end_l, refilled_l),
+    )
+
+
+def _balance(
+    asked_l: float,
+    model_l: float,
+    meter_l: float | None,
+    tank_l: float | None,
+    spread_percent: float | None,
+    levels_l: tuple[float | None, float | None, float | None] = (None, None, None),
+) -> Balance:
+    start_l, end_l, refilled_l = levels_l
     return Balance(
         prescribed_l=asked_l,
         model_l=model_l,
@@ -201,8 +227,14 @@ def balance_of(flight: AppliedFlight, model_ml: float, asked_l: float) -> Balanc
         meter_to_model_percent=_off(meter_l, model_l),
         tank_to_model_percent=_off(tank_l, model_l),
         tank_to_meter_percent=_off(tank_l, meter_l),
-        meter_spread_percent=None if detection is None else 100.0 * detection.spread,
+        meter_spread_percent=spread_percent,
     )
+
+
+def _sum(values: Iterable[float | None]) -> float | None:
+    """Return a sum; of what one flight does not know there is none."""
+    known = list(values)
+    return None if None in known else sum(each for each in known if each is not None)
 
 
 def _tank(flight: AppliedFlight) -> tuple[float | None, float | None, float | None]:
@@ -322,6 +354,51 @@ def essentials_of(flight: AppliedFlight) -> Essentials:
         cells=cell_maps(record, strips, duties_of(flight, record.time_s), flown=ground.own),
         ground=ground,
         balance=balance_of(flight, changes.applied_ml, ground.asked_l),
+    )
+
+
+def together(parts: Sequence[Assessment], treated: Treated) -> Essentials:
+    """Return what all sorties of a job did to one field: ground once, doses and litres in sum."""
+    first, *others = parts
+    evaluations = [each.evaluation for each in parts]
+    steps = tuple(step for each in evaluations for step in each.steps)
+    ground = ground_of(
+        first.flight,
+        first.record,
+        first.strips,
+        treated,
+        also=[(each.flight, each.record, each.strips) for each in others],
+    )
+    balances = [each.balance for each in parts]
+    return Essentials(
+        evaluation=Changes(
+            lag_distance_m=Distances.of(s.lag_distance_m for s in steps if not s.change.border),
+            apart=sum(each.apart for each in evaluations),
+            missed=sum(each.missed for each in evaluations),
+            off_target_ml=sum(each.off_target_ml for each in evaluations),
+            off_line_ml=sum(each.off_line_ml for each in evaluations),
+            applied_ml=sum(each.applied_ml for each in evaluations),
+            steps=steps,
+        ),
+        worst=worst_of(
+            first.flight,
+            first.evaluation.steps,
+            also=[(each.flight, each.evaluation.steps) for each in others],
+        ),
+        cells=cell_maps(
+            first.record,
+            [strip for each in parts for strip in each.strips],
+            [duty for each in parts for duty in duties_of(each.flight, each.record.time_s)],
+            flown=ground.own,
+        ),
+        ground=ground,
+        balance=_balance(
+            ground.asked_l,
+            sum(each.model_l for each in balances),
+            _sum(each.meter_l for each in balances),
+            _sum(each.tank_l for each in balances),
+            first.balance.meter_spread_percent,
+        ),
     )
 
 
@@ -468,7 +545,8 @@ class Figures:
 
     `applied_by` says what the litres are known by; `metered_l` and `modelled_l` stand beside them.
     `prescribed_l` is for the ground treated, as `area_ha` is. `untreated_m2` is all ground with a
-    rate that this flight did not treat, `untreated_percent` its share of such ground; `missed_m2`
+    rate that was not treated, `untreated_l` what the map asks there, `untreated_percent` its share;
+    `missed_m2`
     of it lay under lines that were flown, `left_m2` is other flights'. What fell in the field, off
     the planned lines, is `off_line_ml`. `worst_m` is a bound over `lag_count` of
     `change_count` changes, `unjudged` why not of the others: `analysis.assess.assessment`.
@@ -497,6 +575,7 @@ class Figures:
     doubled_m2: float | None
     untreated_m2: float | None
     untreated_percent: float | None
+    untreated_l: float | None
 
     def as_json(self) -> dict[str, Any]:
         """Return all figures."""
@@ -529,6 +608,7 @@ def nothing_sprayed(area_ha: float | None, *, is_known: bool) -> Figures:
         doubled_m2=None,
         untreated_m2=None,
         untreated_percent=None,
+        untreated_l=None,
     )
 
 
@@ -576,4 +656,5 @@ def figures_of(
         untreated_percent=(
             100.0 * ground.untreated_m2 / ground.rated_m2 if ground.rated_m2 > 0.0 else None
         ),
+        untreated_l=ground.untreated_l,
     )

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from analysis.flight_record import FlightRecord
     from analysis.flown.applied_flight import AppliedFlight, Floats
     from analysis.strips import Strip
-    from analysis.track import Bools, PlannedLines
+    from analysis.track import Bools
 
 # Points of an edge that lie this near to a straight line say nothing of the ground.
 SIMPLIFY_M = 0.03
@@ -67,12 +67,14 @@ class Treated:
         return {"type": "MultiPolygon", "coordinates": polygons}
 
 
-def treated_of(flight: AppliedFlight) -> Treated:
-    """Return the ground that a flight sprayed."""
+def treated_of(*flights: AppliedFlight) -> Treated:
+    """Return the ground that a flight sprayed, or several; only of one flight the times count."""
     strips: list[BaseGeometry] = []
     spans: list[tuple[float, float]] = []
-    heading_deg = _headings(flight)
-    if heading_deg is not None:
+    for flight in flights:
+        heading_deg = _headings(flight)
+        if heading_deg is None:
+            continue
         for number, valve in enumerate(flight.setup.boom.valves):
             for begin_s, end_s in open_spans(flight, number):
                 strip = _strip(flight, heading_deg, valve, begin_s, end_s)
@@ -183,7 +185,7 @@ LATTICE_RAD = 0.5536
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ground:
-    """Areas of the field in square metres, and litres prescribed where it was treated.
+    """Areas of the field in square metres; litres prescribed where it was treated, and where not.
 
     `untreated_m2` has a rate and was not treated in this flight: `missed_m2` of it lay under what
     this flight flew, `between_m2` of that between two passes; all else is left to other flights.
@@ -196,26 +198,34 @@ class Ground:
     missed_m2: float
     between_m2: float
     asked_l: float
+    untreated_l: float
     rated_m2: float
     own: BaseGeometry | None = None
 
 
 def ground_of(
-    flight: AppliedFlight, record: FlightRecord, strips: Sequence[Strip], treated: Treated
+    flight: AppliedFlight,
+    record: FlightRecord,
+    strips: Sequence[Strip],
+    treated: Treated,
+    *,
+    also: Sequence[tuple[AppliedFlight, FlightRecord, Sequence[Strip]]] = (),
 ) -> Ground:
-    """Return what became of the field."""
+    """Return what became of the field, in a flight or with those that went on after it."""
     field = record.prescription.field
     if field.is_empty:
         return Ground(
             treated_m2=0.0, doubled_m2=0.0, untreated_m2=0.0, missed_m2=0.0, between_m2=0.0,
-            asked_l=0.0, rated_m2=0.0,
+            asked_l=0.0, untreated_l=0.0, rated_m2=0.0,
         )  # fmt: skip
     east_m, north_m = _lattice(field)
     each_m2 = field.area / max(len(east_m), 1)
     rates = np.nan_to_num(ground_rates(record.prescription, east_m, north_m))
     is_wet = within(treated.area, east_m, north_m)
     bare = np.flatnonzero((rates > 0.0) & ~is_wet)
-    swept, own = _flown(flight, record, strips[0].track.planned)
+    every = ((flight, record, strips), *also)
+    grounds = [_flown(*each) for each in every]
+    swept, own = (shapely.union_all(each) for each in zip(*grounds, strict=True))
     at = (east_m[bare], north_m[bare])
     missed = within(own, *at)
     if record.treated is not None:
@@ -228,8 +238,9 @@ def ground_of(
         missed_m2=int(missed.sum()) * each_m2,
         between_m2=int(between.sum()) * each_m2,
         asked_l=float(rates[is_wet].sum()) * each_m2 / 1e4,
+        untreated_l=float(rates[bare].sum()) * each_m2 / 1e4,
         rated_m2=int((rates > 0.0).sum()) * each_m2,
-        own=None if strips[0].track.planned is None else own,
+        own=None if all(each[2][0].track.planned is None for each in every) else own,
     )
 
 
@@ -254,9 +265,10 @@ def within(area: BaseGeometry, east_m: Floats, north_m: Floats) -> Bools:
 
 
 def _flown(
-    flight: AppliedFlight, record: FlightRecord, planned: PlannedLines | None
+    flight: AppliedFlight, record: FlightRecord, strips: Sequence[Strip]
 ) -> tuple[BaseGeometry, BaseGeometry]:
     """Return the ground that the boom came over, and that which it was to treat."""
+    planned = strips[0].track.planned
     half_m = max(abs(v.right_m) + 0.5 * v.width_m for v in record.boom.valves)
     path = shapely.LineString(np.column_stack([flight.east_m, flight.north_m])).simplify(SIMPLIFY_M)
     swept = path.buffer(half_m, cap_style="flat")

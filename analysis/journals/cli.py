@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sqlite3
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -12,6 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from analysis.journals.content import read_entries
+from analysis.journals.jobs import joined, one_job
 from analysis.journals.remaining import remaining
 from analysis.journals.salvage import recover_folder
 from companion.cli.answer import AsJson, answer
@@ -180,12 +182,42 @@ def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:g}"
 
 
-SHOW, REMAINING, RECOVER = (
-    typer.Typer(add_completion=False, rich_markup_mode=None) for _ in range(3)
+SHOW, REMAINING, RECOVER, JOB = (
+    typer.Typer(add_completion=False, rich_markup_mode=None) for _ in range(4)
 )
 REMAINING.command(
     epilog="Example: vrspray flights remaining flights/flight-0001.gpkg --out rest.geojson"
 )(remaining)
+
+
+@JOB.command(epilog="Example: vrspray flights job flights/flight-0001.gpkg")
+def job(
+    journals: Annotated[
+        list[Path], typer.Argument(metavar="JOURNAL...", help="One sortie of the job, or several.")
+    ],
+    as_json: AsJson = False,
+) -> None:
+    """List the sorties of a job: flights in the same folder with the id of one plan.
+
+    Flights of the same map within 48 hours are only named: it may be a second treatment.
+    """
+    found, others = joined(one_job(journals))
+    paths = [shlex.quote(str(each.path)) for each in found]
+    more = [shlex.quote(str(each.path)) for each in others]
+    result = {
+        "job": next((each.job for each in found if each.job), None),
+        "sorties": [as_object(look_at(each.path)) for each in found],
+        "perhaps": [as_object(look_at(each.path)) for each in others],
+        "report": f"vrspray report {' '.join(paths)} --out report",
+    }
+    lines = [line_of(look_at(each.path)) for each in found]
+    lines.append(f"report of {counted(len(found), 'sortie')}: {result['report']}")
+    if more:
+        lines.append(
+            f"of the same map within 48 h, perhaps of this job: vrspray flights job "
+            f"{' '.join([*paths, *more])}"
+        )
+    answer(result, lines, as_json=as_json)
 
 
 @SHOW.command(epilog="Example: vrspray flights show flights/flight-0001.gpkg")

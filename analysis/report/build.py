@@ -14,7 +14,7 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -32,13 +32,15 @@ from analysis.flown.read_applied import read_applied
 from analysis.report.clock import Clock, clock_of, duration_text
 from analysis.report.contents import contents_of, reasons_in_words
 from analysis.report.legal import LegalRecord, legal_record
-from analysis.report.legal_fields import Told, facts_of, told_with
+from analysis.report.legal_fields import Facts, Told, facts_of, told_with
 from companion.config.application_table import PROFILES, Profile
 from companion.csv_table import csv_of
 from companion.errors import ConfigError
 
 if TYPE_CHECKING:
     from analysis.flown.applied_flight import AppliedFlight
+    from analysis.report.figure_style import Drawn
+    from companion.simulated import Simulated
 
 Say = Callable[[str], None]
 TOO_LITTLE = "too little of the journal can be read"
@@ -77,6 +79,25 @@ def build_report(journal: Path, options: ReportOptions, *, say: Say = lambda _: 
         JournalError: where the file is not a journal, or one that cannot be read.
         ConfigError: where an entry of the record or the time zone is none.
     """
+    return drawn(judged(journal, options, say=say), options, say=say)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judged:
+    """A journal that was read and evaluated, and what its report says."""
+
+    contents: dict[str, Any]
+    flight: AppliedFlight
+    assessment: Assessment | None
+    treated: Treated
+    clock: Clock
+    told: Told
+    facts: Facts
+    records: list[LegalRecord]
+
+
+def judged(journal: Path, options: ReportOptions, *, say: Say = lambda _: None) -> Judged:
+    """Return what the report of one journal says."""
     say(f"reading {journal.name}")
     unread: list[str] = []
     flight = read_applied(journal, unread=unread)
@@ -91,8 +112,8 @@ def build_report(journal: Path, options: ReportOptions, *, say: Say = lambda _: 
     assessment, why_not = _assessed(flight, treated, is_whole=not (unread or flight.lost))
     clock = _clock(flight, told, treated, options.time_zone)
     figures = figures_of(assessment, area_ha=treated.area_ha, is_whole=not (unread or flight.lost))
-    facts = facts_of(flight, treated, clock, unread=len(unread), **_volumes(figures))
-    records = [legal_record(each, told, facts) for each in _profiles(options, told)]
+    facts = facts_of(flight, treated, clock, unread=len(unread), **volumes(figures))
+    records = [legal_record(each, told, facts) for each in profiles_of(options, told)]
     contents = contents_of(
         flight,
         assessment,
@@ -104,8 +125,27 @@ def build_report(journal: Path, options: ReportOptions, *, say: Say = lambda _: 
         unread=unread,
         why_not_evaluated=why_not,
     )
+    return Judged(
+        contents=contents,
+        flight=flight,
+        assessment=assessment,
+        treated=treated,
+        clock=clock,
+        told=told,
+        facts=facts,
+        records=records,
+    )
+
+
+def drawn(found: Judged, options: ReportOptions, *, say: Say = lambda _: None) -> Report:
+    """Return the files of a report."""
     say("drawing")
-    return _with_files(contents, records, assessment, clock, treated, options)
+    figures: Iterable[Drawn] = ()
+    if options.with_figures and found.assessment is not None:
+        from analysis.report.drawing import drawn_of
+
+        figures = drawn_of(found.assessment, found.clock, found.treated)
+    return with_files(found.contents, found.records, found.flight.simulated, figures, options)
 
 
 def _assessed(
@@ -130,7 +170,7 @@ def _clock(flight: AppliedFlight, told: Told, treated: Treated, time_zone: str |
     return clock if start_time is None else clock.moved_to(start_time, treated.first_s)
 
 
-def _volumes(figures: Figures) -> dict[str, Any]:
+def volumes(figures: Figures) -> dict[str, Any]:
     """Return the litres of the record: those of the headline, and what they are known by."""
     by = figures.applied_by or "nothing"
     return {
@@ -141,25 +181,23 @@ def _volumes(figures: Figures) -> dict[str, Any]:
     }
 
 
-def _profiles(options: ReportOptions, told: Told) -> tuple[Profile, ...]:
+def profiles_of(options: ReportOptions, told: Told) -> tuple[Profile, ...]:
+    """Return whose records are made."""
     if options.profiles:
         return tuple(dict.fromkeys(options.profiles))
     own = told.values.get("application.profile")
     return (own,) if own in PROFILES else ("generic",)
 
 
-def _with_files(
+def with_files(
     contents: dict[str, Any],
-    records: list[LegalRecord],
-    assessment: Assessment | None,
-    clock: Clock,
-    treated: Treated,
+    records: Sequence[LegalRecord],
+    simulated: Simulated,
+    drawings: Iterable[Drawn],
     options: ReportOptions,
 ) -> Report:
-    files: dict[str, bytes] = {}
-    figures: dict[str, dict[str, str]] = {}
-    if options.with_figures and assessment is not None:
-        files, figures = _figures(assessment, clock, treated)
+    """Return the files of a report with these figures."""
+    files, figures = _figures(drawings, simulated)
     contents["figures"] = [name for name in files if name.startswith("figures/")]
     for record in records:
         files[f"application-{record.profile}.json"] = record_json(record)
@@ -173,18 +211,18 @@ def _with_files(
 
 
 def _figures(
-    assessment: Assessment, clock: Clock, treated: Treated
+    drawings: Iterable[Drawn], simulated: Simulated
 ) -> tuple[dict[str, bytes], dict[str, dict[str, str]]]:
     """Return the files of all figures, and how they stand in the page."""
-    from analysis.report.drawing import drawn_of
-    from analysis.report.figure_style import inline_svg, png_of, stamp, styled, svg_of
-
     files: dict[str, bytes] = {}
     figures: dict[str, dict[str, str]] = {}
-    simulated = assessment.flight.simulated
+    if drawings == ():
+        return files, figures
+    from analysis.report.figure_style import inline_svg, png_of, stamp, styled, svg_of
+
     mark = "" if simulated.is_unmarked else simulated.label
     with styled():
-        for each in drawn_of(assessment, clock, treated):
+        for each in drawings:
             stamp(each.figure, mark)
             png, svg = png_of(each), svg_of(each)
             files[f"figures/{each.name}.png"] = png
@@ -209,10 +247,12 @@ def page_of(contents: Mapping[str, Any], figures: Mapping[str, Mapping[str, str]
     shown = {name: {**each, "markup": Markup(each["markup"])} for name, each in figures.items()}
     values = {
         **contents,
-        "setup": _with_pairs(contents["setup"]),
+        "setup": _with_pairs(contents["setup"]) if "setup" in contents else None,
         "table_5": _with_rows(contents.get("table_5")),
         "events_shown": contents["events"][:EVENTS_SHOWN],
-        "evaluated": "breakdowns" in contents,
+        "evaluated": "balance" in contents,
+        "detailed": "breakdowns" in contents,
+        "sorties": contents.get("sorties", []),
         "notes": contents.get("notes", []),
         "stylesheet": Markup(_text_of("page.css")),
         "data": Markup(embedded(contents)),
@@ -338,6 +378,12 @@ def record_csv(record: LegalRecord) -> bytes:
         row[entry.name] = "" if entry.value is None else entry.value
         if entry.unit and not entry.name.endswith(entry.unit.lower().replace("/", "_")):
             row[f"{entry.name}_unit"] = entry.unit
+    if record.sorties:
+        row["sorties"] = "; ".join(
+            f"{each['spraying_from']} to {each['spraying_until']}: {each['applied_l'] or 0.0:.3f} L"
+            f" by {each['aircraft'] or 'an aircraft not named'}"
+            for each in record.sorties
+        )
     row["added_after_flight"] = "; ".join(record.added_after_flight)
     row["remarks"] = "; ".join(record.remarks)
     area = shapely.from_geojson(json.dumps(record.treated_area))

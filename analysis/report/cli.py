@@ -25,7 +25,12 @@ class Law(StrEnum):
 
 @app.command(epilog="Example: vrspray report flights/flight-0001.gpkg --out report --profile eu")
 def report_flight(
-    journal: Annotated[Path, typer.Argument(help="Journal of a flight, such as flight-0001.gpkg.")],
+    journals: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="JOURNAL...", help="Journal of a flight; of a job, those of all its sorties."
+        ),
+    ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the files of the report.")],
     profile: Annotated[
         list[Law] | None,
@@ -55,7 +60,9 @@ def report_flight(
     is_plain: Annotated[bool, typer.Option("--no-figures", help="Leave out all figures.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Evaluate a flight and write its report, with all figures and the application record.
+    """Evaluate a flight, or all sorties of a job, and write one report with its record.
+
+    Several journals are one field: ground counts once, doses and litres add up.
 
     Exit 0: written; 1: of a journal that was cut, is damaged, lacks rows or is of another version:
     what can be read is written; 2: no journal, an option is wrong, or DIR cannot be written.
@@ -63,6 +70,7 @@ def report_flight(
     from analysis.report.build import ReportOptions, browser, build_report
     from analysis.report.clock import zone_of
     from analysis.report.folder import check_folder, earlier_files, write_files
+    from analysis.report.job import build_job
 
     began_s = time.perf_counter()
     check_folder(out)
@@ -78,7 +86,10 @@ def report_flight(
         with_figures=not is_plain,
         with_pdf=is_pdf,
     )
-    report = build_report(journal, options, say=note)
+    if len(journals) > 1:
+        report = build_job(journals, options, say=note)
+    else:
+        report = build_report(journals[0], options, say=note)
     write_files(out, report.files, without=earlier_files(out, report.files))
     contents = report.contents
     for warning in contents["warnings"]:

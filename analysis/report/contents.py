@@ -365,7 +365,7 @@ def warnings_of(
         *_wishes(flight, clock),
         *_wind(flight),
         *_flow(assessment, why_not_evaluated),
-        *_records(records),
+        *record_warnings(records),
     ]
     order = ("mark", "warning", "note")
     return sorted(found, key=lambda each: order.index(each.severity))
@@ -560,7 +560,8 @@ def _listed(labels: Sequence[str]) -> str:
     return f"{', '.join(labels[:LABELS_LISTED])} and {len(labels) - LABELS_LISTED} more"
 
 
-def _records(records: Sequence[LegalRecord]) -> Iterator[Caution]:
+def record_warnings(records: Sequence[LegalRecord]) -> Iterator[Caution]:
+    """Yield which records are not complete."""
     for record in records:
         if not record.is_complete:
             yield _warning(

@@ -27,7 +27,7 @@ from companion.config.application_table import Profile, is_told
 from companion.config.legal_entries import ASKED, missing
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from analysis.report.legal_fields import Told
     from companion.simulated import Simulated
@@ -81,6 +81,7 @@ class LegalRecord:
     simulated: Simulated
     treated_area: dict[str, Any]
     date: str | None = None
+    sorties: Sequence[dict[str, Any]] = ()
 
     @property
     def keep_until(self) -> str | None:
@@ -135,6 +136,7 @@ class LegalRecord:
                 for entry in self.entries
             },
             "remarks": list(self.remarks),
+            **({"sorties": list(self.sorties)} if self.sorties else {}),
             "treated_area": self.treated_area,
         }
 

@@ -53,7 +53,7 @@ app = typer.Typer(
     cls=FlightsTable,
     add_completion=False,
     rich_markup_mode=None,
-    help="Journals of flights: list, show, remaining, pin, unpin, prune, recover.",
+    help="Journals of flights: list, show, job, remaining, pin, unpin, prune, recover.",
     epilog="Example: vrspray flights list --folder flights",
 )
 FAILED = 1

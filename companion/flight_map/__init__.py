@@ -6,6 +6,7 @@ it was made with, and what was found on the way.
 """
 
 from companion.flight_map.file import (
+    JOB_KEY,
     SUFFIX,
     FlightMap,
     SourceFile,
@@ -18,6 +19,7 @@ from companion.flight_map.file import (
 )
 
 __all__ = [
+    "JOB_KEY",
     "SUFFIX",
     "FlightMap",
     "SourceFile",

@@ -197,6 +197,8 @@ _FROZEN = ("overlap", "default_rate_l_ha", "unit", "density_kg_l", "boundary", "
 # How the source was read: a configuration that says nothing of it does not object.
 _READING = ("rate_field", "crs", "layer", "flow_width_m", "flow_speed_m_s", "merge", "origin")
 _LINES = "mission.lines"
+# No setting of a configuration: the id of the plan, by which journals are sorties of one job.
+JOB_KEY = "mission.job"
 _BUFFERS = "limits.buffer"
 
 

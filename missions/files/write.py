@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -164,22 +165,29 @@ def _named(out: Path, ends: str, written: Sequence[Path]) -> list[Path]:
 
 
 def write_plan(
-    plan: Plan, out: Path, *, with_sprayer: bool = False, fences: Fences | None = None
+    plan: Plan,
+    out: Path,
+    *,
+    with_sprayer: bool = False,
+    fences: Fences | None = None,
+    job: str | None = None,
 ) -> list[Path]:
     """Write the plan and return its files; all texts are made before the first is written.
 
-    The lines, beside missions that have no marks for them, are not among these files.
+    The lines, beside missions that have no marks for them, are not among these files. `job` is the
+    id of a plan that this one is a part of.
     """
     check_suffix(out)
-    suffix = out.suffix.casefold()
+    suffix, job = out.suffix.casefold(), job or job_of(plan)
     if suffix == ".geojson":
-        texts = [lines_text(plan)]
+        texts = [lines_text(plan, job)]
     elif suffix == ".kml":
         texts = [plan_kml(plan)]
     elif suffix == ".plan":
         fences = fences or Fences(plan)
         texts = [
-            plan_text(plan, each, with_sprayer=with_sprayer, fences=fences) for each in plan.sorties
+            plan_text(plan, each, with_sprayer=with_sprayer, fences=fences, job=job)
+            for each in plan.sorties
         ]
     else:
         texts = [waypoints_text(plan, each, with_sprayer=with_sprayer) for each in plan.sorties]
@@ -187,7 +195,7 @@ def write_plan(
     marks = lines_path(out)
     if marks is not None and marks not in paths:
         # First: whoever finds a mission finds its lines.
-        write_whole(marks, lines_text(plan).encode("utf-8"))
+        write_whole(marks, lines_text(plan, job).encode("utf-8"))
     for path, text in zip(paths, texts, strict=True):
         write_whole(path, text.encode("utf-8"))
     return paths
@@ -220,8 +228,9 @@ def write_fleet(
         own = [sortie for sortie in plan.sorties if sortie.aircraft == aircraft]
         path = fleet_path(out, aircraft, count)
         files += write_plan(
-            replace(plan, sorties=tuple(own)), path, with_sprayer=with_sprayer, fences=fences
-        )
+            replace(plan, sorties=tuple(own)), path,
+            with_sprayer=with_sprayer, fences=fences, job=job_of(plan),
+        )  # fmt: skip
         lines = lines_path(path)
         if lines is not None:
             marks.append(lines)
@@ -231,7 +240,12 @@ def write_fleet(
 # The whole plan as GeoJSON: a line for each leg, a point for each depot.
 
 
-def lines_text(plan: Plan) -> str:
+def job_of(plan: Plan) -> str:
+    """Return the id that joins the journals of all sorties, whichever aircraft fly them."""
+    return hashlib.sha256(lines_text(plan).encode()).hexdigest()[:12]
+
+
+def lines_text(plan: Plan, job: str | None = None) -> str:
     """Return the content of the file."""
     features = [
         _leg(plan, sortie, sequence, leg)
@@ -240,7 +254,7 @@ def lines_text(plan: Plan) -> str:
         if leg.length_m > 0.0
     ]
     features += [_depot(plan, number, depot) for number, depot in enumerate(plan.depots, start=1)]
-    return geojson_text(features)
+    return geojson_text(features, **({} if job is None else {"job": job}))
 
 
 def _place(plan: Plan, place: Place) -> list[float]:
@@ -330,7 +344,12 @@ ALTITUDE_MODES = {RELATIVE: 1, 0: 2, ABOVE_GROUND: 4}
 
 
 def plan_text(
-    plan: Plan, sortie: Sortie, *, with_sprayer: bool = False, fences: Fences | None = None
+    plan: Plan,
+    sortie: Sortie,
+    *,
+    with_sprayer: bool = False,
+    fences: Fences | None = None,
+    job: str | None = None,
 ) -> str:
     """Return the content of the file; `fences` are those of the plan, where they are at hand."""
     fence = (fences or Fences(plan)).of(sortie)
@@ -345,7 +364,7 @@ def plan_text(
         rally=[plan.frame.to_geographic(*depot) for depot in plan.depots],
     )
     check_content(plan, sortie, content)
-    return plan_json(content)
+    return plan_json(content | ({} if job is None else {"vrspray": {"job": job}}))
 
 
 def plan_content(

@@ -6,6 +6,7 @@ import getpass
 import json
 import math
 import platform
+import re
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -28,7 +29,13 @@ from companion.core.options.lines import Polyline
 from companion.core.prescription import FIELD, Prescription
 from companion.core.setup import Setup
 from companion.errors import ConfigError, MapError, Problem
-from companion.flight_map import FlightMap, frozen_settings, is_flight_map, read_flight_map
+from companion.flight_map import (
+    JOB_KEY,
+    FlightMap,
+    frozen_settings,
+    is_flight_map,
+    read_flight_map,
+)
 from companion.flight_map.child import sources_of
 from companion.flight_map.file import SCHEMA, VERSION, content_sha256, named_files
 from companion.journal.geopackage import (
@@ -197,7 +204,7 @@ def compile_map(
             area if area.is_valid else (make_valid(area) or MultiPolygon()) for area in local
         ),
         polylines=_polylines(order, frame, prescription),
-        frozen=frozen_settings(table, order.lines, order.buffers),
+        frozen=frozen_settings(table, order.lines, order.buffers) | _job(order),
         sources=sources_of(order.files()),
         findings=tuple(findings),
     )
@@ -262,6 +269,12 @@ def _polylines(order: MapOrder, frame: LocalFrame, ground: Prescription) -> tupl
     return polylines
 
 
+def _job(order: MapOrder) -> dict[str, object]:
+    """Return the id of the job that the lines were planned for, as a setting of the flight map."""
+    found = None if order.lines is None else _document(order.resolve(order.lines)).get("job")
+    return {JOB_KEY: found} if isinstance(found, str) and _JOB.fullmatch(found) else {}
+
+
 def _meets(built: Prescription) -> bool:
     """Tell whether anything of the map lies on ground that may be sprayed."""
     if built.cells is not None:
@@ -279,6 +292,7 @@ JOINED_M = 0.6
 # At a sharper bend the vehicle stops, and both lines keep their own ends.
 BEND_MAX_DEG = 30.0
 POINTS_MAX = 1_000_000
+_JOB = re.compile(r"[0-9a-f]{12}")
 _FIX = "name the .geojson, or the .lines.geojson, that `vrspray plan` wrote"
 
 

@@ -9,13 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shapely
 
-from analysis.assess.assessment import Assessment, assess
+from analysis.assess.assessment import Assessment, assess, together
+from analysis.assess.ground import Treated, treated_of
 from analysis.exports.source import Source
 from analysis.flown.read_applied import read_applied
-from analysis.report.build import ReportOptions, build_report
+from analysis.report.build import Report, ReportOptions, build_report
+from analysis.report.job import build_job
 from companion.cli.app import execute
-from tests.ground_judge import Field, Truth, Verdict, doses_of, judge
+from tests.ground_judge import Field, Truth, Verdict, doses_of, judge, to_local
 
 EXAMPLE = Path("examples/anyang/config.toml")
 # Areas to 1 % of the field, litres to 0.5 %.
@@ -198,9 +201,26 @@ def test_ground_that_two_passes_sprayed_is_shown_with_both(
     assert np.nanpercentile(cells.relative_error_percent, 95) > 30.0
 
 
-def test_what_sorties_missed_adds_up_to_what_all_of_them_left_bare(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> None:
+@dataclass(frozen=True)
+class Job:
+    """A field in three sorties: their reports, that of all of them, and what the truth says."""
+
+    journals: list[Path]
+    flights: list[Flown]
+    verdict: Verdict
+    report: Report
+
+    @property
+    def within(self) -> dict[str, float]:
+        return {"abs": AREA * self.verdict.field_m2}
+
+
+# The first of its tests flies three sorties.
+pytestmark = pytest.mark.timeout(300)
+
+
+@pytest.fixture(scope="module")
+def job(tmp_path_factory: pytest.TempPathFactory) -> Job:
     folder = tmp_path_factory.mktemp("job")
     flights = [fly(folder, ASKEW, True, "--tank-l", "5")]
     flights += [
@@ -208,15 +228,69 @@ def test_what_sorties_missed_adds_up_to_what_all_of_them_left_bare(
         for number in range(2, 1 + len(list(folder.glob("field*.plan"))))
     ]
     assert len(flights) > 2
-    all_of_them = judge([each.truth for each in flights], flights[0].field)
-    figures = [each.contents["verdict"] for each in flights]
-    within = {"abs": 2.0 * AREA * all_of_them.field_m2}
-    # Where two sorties' bands meet, what one left bare the other may have treated.
-    assert sum(each["missed_m2"] for each in figures) == pytest.approx(
-        all_of_them.bare_m2, **within
+    journals = sorted(folder.glob("flown*/flight-0001.gpkg"))
+    return Job(
+        journals=journals,
+        flights=flights,
+        verdict=judge([each.truth for each in flights], flights[0].field),
+        # In any order.
+        report=build_job(journals[::-1], ReportOptions(with_figures=False)),
     )
-    treated_m2 = sum(1e4 * each["area_ha"] - each["doubled_m2"] for each in figures)
-    assert treated_m2 == pytest.approx(all_of_them.treated_m2, **within)
-    assert sum(each["metered_l"] for each in figures) == pytest.approx(
-        all_of_them.applied_l, rel=LITRES
+
+
+def test_the_ground_of_a_job_is_what_the_truth_says(job: Job) -> None:
+    said, true = job.report.contents["verdict"], job.verdict
+    assert said["area_ha"] * 1e4 == pytest.approx(true.treated_m2, **job.within)
+    assert said["doubled_m2"] == pytest.approx(true.twice_m2, **job.within)
+    assert said["untreated_m2"] == pytest.approx(true.bare_m2, **job.within)
+    assert said["missed_m2"] == pytest.approx(true.missed_m2, **job.within)
+    # Where two sorties' bands meet, ground is counted by both: their sums say too much.
+    overlap_m2 = sum(1e4 * each.contents["verdict"]["area_ha"] for each in job.flights)
+    assert overlap_m2 - true.treated_m2 > 0.01 * true.field_m2
+    # One map has one rate: what is missing of it is the litres that are left.
+    assert said["untreated_l"] == pytest.approx(20.0 * said["untreated_m2"] / 1e4, rel=1e-3)
+
+
+def test_the_litres_of_a_job_are_what_the_truth_says(job: Job) -> None:
+    said, true = job.report.contents["verdict"], job.verdict
+    for name in ("applied_l", "metered_l", "modelled_l"):
+        assert said[name] == pytest.approx(true.applied_l, rel=LITRES), name
+    assert said["prescribed_l"] == pytest.approx(true.asked_l, rel=LITRES)
+    assert said["outside_ml"] == pytest.approx(true.outside_ml, abs=0.5)
+    rows = job.report.contents["sorties"]
+    for row, flight in zip(rows, job.flights, strict=True):
+        assert row["applied_l"] == pytest.approx(flight.verdict.applied_l, rel=LITRES)
+        assert row["spraying_from"] < row["spraying_until"]
+
+
+def test_the_record_of_a_job_has_its_ground_and_litres_once_and_each_sortie(job: Job) -> None:
+    record = json.loads(job.report.files["application-generic.json"])
+    true, fields = job.verdict, record["fields"]
+    assert fields["volume_l"]["value"] == pytest.approx(true.applied_l, rel=LITRES)
+    assert 1e4 * fields["treated_area_ha"]["value"] == pytest.approx(true.treated_m2, **job.within)
+    area = shapely.from_geojson(json.dumps(record["treated_area"]))
+    origin_deg = job.flights[0].truth.origin_deg
+    area = shapely.transform(area, lambda xy: to_local(xy, origin_deg))
+    assert area.area == pytest.approx(true.treated_m2, **job.within)
+    assert area.symmetric_difference(true.treated).area < 2 * AREA * true.field_m2
+    assert [each["sortie"] for each in record["sorties"]] == [1, 2, 3]
+    assert sum(each["applied_l"] for each in record["sorties"]) == pytest.approx(
+        fields["volume_l"]["value"], abs=1e-3
     )
+
+
+def test_the_doses_of_a_job_are_sums_over_its_sorties(job: Job) -> None:
+    cells = together([each.assessed for each in job.flights], treated(job)).cells
+    assert cells is not None
+    west_m, south_m = float(cells.corner_east_m[0, 0]), float(cells.corner_north_m[0, 0])
+    shape = cells.measured_l_ha.shape
+    truths = [each.truth for each in job.flights]
+    true = doses_of(truths, job.flights[0].field, west_m, south_m, cells.cell_m, shape)
+    whole = (true.ground_m2 > 0.5 * cells.cell_m**2) & np.isfinite(cells.measured_l_ha)
+    off = np.abs(cells.measured_l_ha - true.dose_l_ha)[whole] / true.asked_l_ha[whole]
+    assert np.median(off) < 0.03
+    assert np.percentile(off, 95) < 0.15
+
+
+def treated(job: Job) -> Treated:
+    return treated_of(*(each.assessed.flight for each in job.flights))

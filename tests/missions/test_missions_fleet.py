@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from itertools import combinations
 from pathlib import Path
 
@@ -110,6 +111,16 @@ def test_each_aircraft_gets_its_files_and_its_lines(tmp_path: Path) -> None:
     assert {"m-a1.plan", "m-a2.plan"} <= {path.name for path in files}
     assert len(lines) == 2
     assert all(path.exists() for path in (*files, *lines))
+
+
+def test_all_sorties_of_a_plan_have_one_job_and_another_plan_another(tmp_path: Path) -> None:
+    files, lines = write_fleet(fleet(tank_l=40.0), tmp_path / "m.plan")
+    documents = [json.loads(path.read_text()) for path in (*files, *lines)]
+    jobs = {each.get("job") or each["vrspray"]["job"] for each in documents}
+    assert len(documents) > 3
+    assert len(jobs) == 1
+    _, (other,) = write_fleet(fleet(aircraft=1, tank_l=40.0), tmp_path / "n.plan")
+    assert json.loads(other.read_text())["job"] not in jobs
 
 
 def test_the_sheet_says_who_waits_for_whom() -> None:

@@ -21,9 +21,10 @@ from companion.config import load
 from companion.core.frame import LocalFrame
 from companion.core.options.lines import Lines
 from companion.errors import ConfigError, MapError
+from companion.flight_map import JOB_KEY
 from companion.journal.codec import field_names_of, setup_from_json, setup_to_json
 from companion.journal.geopackage import Ground
-from missions.maps.compiling import compiled_setup, read_plan_lines
+from missions.maps.compiling import MapOrder, compile_map, compiled_setup, read_plan_lines
 from tests.builders import setup
 
 EXAMPLE = "examples/anyang/config.toml"
@@ -133,6 +134,13 @@ def test_the_papers_field_is_planned_and_flown_with_nothing_off_its_lines(
     assert "mission.lines" not in str(json.loads(capsys.readouterr().out)["warnings"])
     execute(["config", "check", EXAMPLE, "--json", *own])
     assert "mission.lines" not in str(json.loads(capsys.readouterr().out)["notes"])
+    # The flight map, and with it every journal, names the plan's job; lines of before had none.
+    order = MapOrder.of(load(Path(EXAMPLE), overrides=own[1:]))
+    assert compile_map(order).as_object()["frozen"][JOB_KEY] == json.loads(lines.read_text())["job"]
+    old = tmp_path / "old.geojson"
+    old.write_text(lines.read_text().replace('"job"', '"jobs"'))
+    frozen = compile_map(replace(order, lines=str(old))).frozen
+    assert JOB_KEY not in frozen
     copied = tmp_path / "config.toml"
     for file in (*Path("examples/anyang").glob("prescription.*"), BOUNDARY):
         shutil.copy(file, tmp_path)
