@@ -6,6 +6,8 @@ the same volume stands where the lines meet. Each line goes through one point ne
 has the slope of up to twenty periods; both are taken from smoothed volume and distance, so that
 neither the pulses' phase nor the speed matters.
 
+On cells of a metre or two there is no room for lines: `analysis.by_volume` judges such a change.
+
 P1 judged its sprayer by the flow that its own controller had ordered. So the target here is what
 the orders in force ask for, as long as they ask for the new rate: a controller that follows a gust
 0.7 s late is no change that came late. P1 read a log of five positions a second; here it is the
@@ -21,6 +23,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from analysis.by_volume import late_by_volume
 from analysis.changes import Change, changes_of
 from analysis.flight_record import Orders
 from analysis.flown.modelled_flow import flow_of, set_in_force
@@ -78,13 +81,15 @@ class Step:
     """A change and its volume-equivalent step; + is too late. None where it is not measured.
 
     Borders have one too: the switches' gaps and overlaps come from it. `dry` says that the valve
-    was closed before or after, where something is prescribed.
+    was closed before or after, where something is prescribed. `volume_m` is the way over which a
+    change too close for lines was judged by volume; 0 for one by lines.
     """
 
     change: Change
     verdict: Verdict
     dry: bool
     lag_distance_m: float | None = None
+    volume_m: float = 0.0
 
 
 class _Lines(NamedTuple):
@@ -111,6 +116,7 @@ def measure_steps(
     asked, given = _doses_ml_m(track, changes, transitions)
     dry = np.any(given < DRY_BELOW * asked, axis=1).tolist()
     saturated = _are_saturated(orders, duty_limits, sides, asked, given).tolist()
+    by_volume = late_by_volume(smooth, changes, sides)
     steps: list[Step] = []
     for i, change in enumerate(changes):
         if change is None:
@@ -122,7 +128,15 @@ def measure_steps(
         if verdict is Verdict.MEASURED:
             lag_m = lags_m[i]
             verdict = Verdict.CLOSE if lag_m is None else verdict
-        steps.append(Step(change=change, verdict=verdict, dry=dry[i], lag_distance_m=lag_m))
+        volume_m = 0.0
+        if verdict is Verdict.CLOSE and i in by_volume:
+            verdict = Verdict.SATURATED if saturated[i] else Verdict.MEASURED
+            lag_m, volume_m = (None, 0.0) if saturated[i] else by_volume[i]
+        steps.append(
+            Step(
+                change=change, verdict=verdict, dry=dry[i], lag_distance_m=lag_m, volume_m=volume_m
+            )
+        )
     return steps
 
 

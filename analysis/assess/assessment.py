@@ -127,7 +127,9 @@ def uncertainty_m(step: Step, lag: LagModel) -> float:
         lag.up_s if change.after_l_ha > change.before_l_ha else lag.down_s,
     )
     time_s = math.hypot(JITTER_S, CALIBRATION_S, FRAME_S, PULSE_S, VALVE_SHARE * its_s)
-    return math.hypot(POSITION_M, change.speed_m_s * time_s, FLOW_M / change.relative)
+    # By volume the flow's noise is that of the whole way, which is longer than a line's metre.
+    flow_m = FLOW_M * max(step.volume_m, 1.0) / change.relative
+    return math.hypot(POSITION_M, change.speed_m_s * time_s, flow_m)
 
 
 def bound_m(lag_m: Floats, sd_m: Floats, confidence: float = CONFIDENCE) -> float:

@@ -327,7 +327,7 @@ def sentence_of(figures: Figures, training: str | None) -> str:
 
 WHY_NOT = {
     "small": "below 8 %",
-    "close": "too close to the next one",
+    "close": "beside a strip too short for the valves",
     "saturated": "at the end of the valves' range",
     "border": "held by the border",
     "unknown": "not recorded",

@@ -33,6 +33,7 @@ class Flight:
     """What is flown. `lag_m(change index)` places the flow's steps, borders apart."""
 
     rates: Sequence[Sequence[float]]
+    plot_m: float = PLOT_M
     valves: int = 6
     speed_m_s: float = 5.0
     ripple_m_s: float = 0.0
@@ -67,12 +68,12 @@ def boom_of(valves: int, forward_m: float = 0.0) -> Boom:
     )
 
 
-def field_of(rates: Sequence[Sequence[float]]) -> Prescription:
+def field_of(rates: Sequence[Sequence[float]], plot_m: float = PLOT_M) -> Prescription:
     return Prescription(
         [
             Zone(
                 name=f"{p}-{i}",
-                polygon=box(i * PLOT_M, p * SWATH_M, (i + 1) * PLOT_M, (p + 1) * SWATH_M),
+                polygon=box(i * plot_m, p * SWATH_M, (i + 1) * plot_m, (p + 1) * SWATH_M),
                 rate_l_ha=rate,
             )
             for p, row in enumerate(rates)
@@ -83,7 +84,7 @@ def field_of(rates: Sequence[Sequence[float]]) -> Prescription:
 
 def path_at(flight: Flight, distance_m: Floats) -> tuple[Floats, Floats, Floats]:
     """Return east, north, heading along the serpentine."""
-    length_m = len(flight.rates[0]) * PLOT_M + 2 * RUN_UP_M
+    length_m = len(flight.rates[0]) * flight.plot_m + 2 * RUN_UP_M
     turn_m = np.pi * SWATH_M / 2
     number = np.floor(distance_m / (length_m + turn_m)).astype(int)
     along = distance_m - number * (length_m + turn_m)
@@ -100,7 +101,7 @@ def path_at(flight: Flight, distance_m: Floats) -> tuple[Floats, Floats, Floats]
 
 def steps_of(flight: Flight) -> tuple[list[tuple[float, float]], list[float]]:
     """Return (distance, rate from there on) of the flow's steps, and the lags inside the field."""
-    length_m = len(flight.rates[0]) * PLOT_M + 2 * RUN_UP_M
+    length_m = len(flight.rates[0]) * flight.plot_m + 2 * RUN_UP_M
     steps: list[tuple[float, float]] = []
     lags: list[float] = []
     number = 0
@@ -113,10 +114,10 @@ def steps_of(flight: Flight) -> tuple[list[tuple[float, float]], list[float]]:
                 continue
             lag_m = flight.lag_m(number)
             if number not in flight.ignore:
-                steps.append((start_m + i * PLOT_M + lag_m, order[i]))
+                steps.append((start_m + i * flight.plot_m + lag_m, order[i]))
                 lags.append(lag_m)
             number += 1
-        steps.append((start_m + len(order) * PLOT_M - flight.border_m, 0.0))
+        steps.append((start_m + len(order) * flight.plot_m - flight.border_m, 0.0))
     return steps, lags
 
 
@@ -124,7 +125,7 @@ def record_of(flight: Flight) -> tuple[FlightRecord, list[float]]:
     """Return the record of a flight and the lags that its flow has."""
     rng = np.random.default_rng(flight.seed)
     passes = len(flight.rates)
-    length_m = len(flight.rates[0]) * PLOT_M + 2 * RUN_UP_M
+    length_m = len(flight.rates[0]) * flight.plot_m + 2 * RUN_UP_M
     total_m = passes * length_m + (passes - 1) * np.pi * SWATH_M / 2
     time_s = np.arange(0.0, total_m / flight.speed_m_s, flight.step_s)
     distance_m = flight.speed_m_s * time_s
@@ -148,7 +149,7 @@ def record_of(flight: Flight) -> tuple[FlightRecord, list[float]]:
         heading_deg=heading_deg,
         volume_ml=np.stack(volumes, axis=1),
         boom=boom,
-        prescription=field_of(flight.rates),
+        prescription=field_of(flight.rates, flight.plot_m),
         pwm_period_s=PERIOD_S,
         orders=orders,
         meta=FlightMeta(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,12 +24,14 @@ def spread(number: int) -> float:
     return 0.11 * (number % 5) - 0.2
 
 
-def errors_m(flight: Flight) -> np.ndarray:
-    """Return what is measured less what is true, of every change inside the field."""
+def errors_m(flight: Flight, *, judged: float = 1.0) -> np.ndarray:
+    """Return what is measured less what is true, of all changes in the field, or this share."""
     record, true_m = record_of(flight)
     steps = [step for step in evaluate(record).steps if not step.change.border]
-    assert [step.verdict for step in steps] == [Verdict.MEASURED] * len(true_m)
-    return np.array([step.lag_distance_m for step in steps]) - np.array(true_m)
+    is_judged = np.array([step.verdict is Verdict.MEASURED for step in steps])
+    assert is_judged.mean() >= judged
+    lags_m = np.array([step.lag_distance_m for step in steps], dtype=np.float64)
+    return (lags_m - np.array(true_m))[is_judged]
 
 
 @pytest.mark.parametrize("steps", [SMALL_STEPS, LARGE_STEPS], ids=["15 %", "30 %"])
@@ -174,11 +177,45 @@ def test_zones_shorter_than_the_plant_can_follow_are_apart() -> None:
     assert (evaluation.apart, evaluation.missed) == (2, 0)
 
 
-def test_a_flow_still_settling_at_the_next_change_is_apart() -> None:
+def test_a_flow_still_settling_at_the_next_change_is_judged_by_volume() -> None:
     # Its line would be drawn backwards over the change itself: lags of tens of metres came of it.
     flight = Flight(rates=[[20.0, 23.0, 40.0, 23.0, 20.0]], valves=1, tail_m=4.0)
-    verdicts = [step.verdict for step in evaluated(flight).steps if not step.change.border]
-    assert verdicts == [Verdict.CLOSE] * 4
+    assert np.abs(errors_m(flight)).max() < 0.8
+
+
+def cells(seed: int, plot_m: float, **more: Any) -> Flight:
+    """Return a flight over plots as small as the cells of a real map, of five rates."""
+    rates = np.random.default_rng(seed).choice([10.0, 14.0, 18.0, 22.0, 26.0], (2, 40))
+    return Flight(rates=rates.tolist(), plot_m=plot_m, valves=2, seed=seed, **more)
+
+
+@pytest.mark.parametrize("plot_m", [1.5, 2.0, 3.0])
+@pytest.mark.parametrize(
+    "shape", [{}, {"pulsed": True, "ripple_m_s": 0.3}, {"scale": 1.05}], ids=str
+)
+@pytest.mark.parametrize("shift_m", [-0.3, 0.2, 0.5])
+def test_a_shift_of_all_valves_comes_back_on_cells_of_a_metre_or_two(
+    plot_m: float, shape: dict[str, Any], shift_m: float
+) -> None:
+    errors = errors_m(cells(3, plot_m, lag_m=lambda _: shift_m, **shape), judged=0.98)
+    assert np.abs(errors).max() < 0.03
+
+
+@pytest.mark.parametrize("plot_m", [1.5, 2.0, 3.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_each_change_s_own_shift_comes_back_on_cells(plot_m: float, seed: int) -> None:
+    own_m = np.random.default_rng(seed).uniform(-0.3, 0.4, 100)
+    flight = cells(seed, plot_m, lag_m=lambda number: float(own_m[number]), pulsed=True)
+    errors = errors_m(flight, judged=0.98)
+    # The dose is not known better than the shifts around let it be.
+    assert abs(np.median(errors)) < 0.03
+    assert np.sqrt((errors**2).mean()) < 0.12
+    assert np.abs(errors).max() < 0.4
+
+
+def test_slivers_that_no_valve_follows_are_apart_still() -> None:
+    evaluation = evaluated(cells(1, 0.5))
+    assert evaluation.apart > 0.5 * len([s for s in evaluation.steps if not s.change.border])
 
 
 def saturated(duties: list[float], rates: list[float], given: list[float]) -> Evaluation:
