@@ -61,7 +61,7 @@ from sitl.recorded import (
     held,
     paths_of,
     read_flight,
-    receiver_behind,
+    receiver_of,
     rows_of,
 )
 
@@ -86,8 +86,6 @@ FINE_S, PLAN_S, LEASE_S = 0.002, 0.05, 0.3
 # So long before and after a boundary a change is judged, and from so near on its levels.
 AROUND_S, LEVEL_FROM_S, MISSED_BELOW, MOVED_M = 0.5, 0.2, 0.5, 0.1
 RATE_MIN_HZ, RATE_MAX_HZ, FLIGHTS_MAX = 4.0, 50.0, 100
-# Receivers are rarely earlier or later, and an estimate farther from one (from RTK) is at fault.
-BEHIND_MIN_S, BEHIND_MAX_S, OFF_MAX_M, OFF_RTK_M = 0.02, 0.25, 0.5, 0.3
 
 METHODS = ("vrspray", "perfect", "none", "look-ahead")
 
@@ -155,6 +153,7 @@ def prepare(options: AlongOptions) -> Bed:
         f"reported and smoothed positions differ by {math.sqrt(float(off_m2.mean())):.2f} m (rms); "
         "smaller differences in the table mean nothing"
     )
+    receiver = receiver_of(flight)
     limits, eased = _eased(setup.limits, flight)
     lag = replace(setup.lag, position_s=POSITION_S)
     return Bed(
@@ -165,22 +164,7 @@ def prepare(options: AlongOptions) -> Bed:
         profile=_plant(options.plant, setup),
         output="gpio" if config.output.kind == "gpio" else "servo",
         rate_hz=rate_hz,
-        notes=(*notes, *_receiver(flight, receiver_behind(flight, path, earth)), *eased),
-    )
-
-
-def _receiver(flight: Recorded, behind: tuple[float, float] | None) -> Iterator[str]:
-    """Yield where the receiver's own positions lie against the autopilot's."""
-    if behind is None:
-        return
-    late_s, off_m = behind
-    is_rtk = min((fix for _, fix in flight.fixes), default=0) >= Fix.RTK_FLOAT
-    is_usual = BEHIND_MIN_S <= late_s <= BEHIND_MAX_S
-    is_near = off_m <= (OFF_RTK_M if is_rtk else OFF_MAX_M)
-    yield (
-        "receiver behind estimator (the delay the autopilot assumes, not a measured one): "
-        f"{1000.0 * late_s:.0f} ms, {off_m:.2f} m beside it"
-        f"{'' if is_usual and is_near else ', which is UNUSUAL'}"
+        notes=(*notes, *([] if receiver is None else [receiver.words]), *eased),
     )
 
 

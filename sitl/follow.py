@@ -5,22 +5,26 @@ It truly flies the smoothed path, and tells what was told along it, in the modes
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sitl.earth import Earth
 from sitl.recorded import Recorded, paths_of
 from sitl.stub.world import Estimator, Pose
-from sitl.trajectory import Trajectory
+from sitl.trajectory import Floats, Trajectory
 
 
 @dataclass(slots=True)
 class Along:
-    """A motion along a path from `start_s` on, before it at its start."""
+    """A motion along a path from `start_s` on, before it at its start.
+
+    `fixes` are times, metres east and north that the receiver told.
+    """
 
     path: Trajectory
     flight: Recorded
+    fixes: Floats
     start_s: float = np.inf
 
     def log_s(self, now_s: float) -> float:
@@ -59,8 +63,19 @@ class Told(Estimator):
         """Return what was told of a time."""
         return self._along.pose_at(now_s)
 
+    def fix(self, now_s: float) -> Pose:
+        """Return the last place of the receiver, at its stamp."""
+        told, at_s = self.estimate(now_s), self._along.log_s(now_s)
+        number = int(np.searchsorted(self._along.fixes[0], at_s, side="right")) - 1
+        if number < 0:
+            return told
+        fixed_s, east_m, north_m = self._along.fixes[:, number].tolist()
+        return replace(told, time_s=now_s - (at_s - fixed_s), east_m=east_m, north_m=north_m)
+
 
 def along(flight: Recorded, home: Earth) -> tuple[Along, Along]:
     """Return the true motion, and the one that was told."""
     path, told = paths_of(flight, home)
-    return Along(path, flight), Along(told, flight)
+    time_s, *place = flight.receiver[:, flight.receiver[1:].any(axis=0)]
+    fixes = np.array([time_s, *home.to_local_all(*place)])
+    return Along(path, flight, fixes), Along(told, flight, fixes)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from companion.errors import ConfigError
 from companion.flight_modes import COPTER
+from companion.receiver import ReceiverOffset, offset_of
 from companion.wording import counted, missing
 from sitl.earth import Earth
 from sitl.smoother import true_path
@@ -93,22 +94,16 @@ def paths_of(flight: Recorded, earth: Earth) -> tuple[Trajectory, Trajectory]:
     )
 
 
-def receiver_behind(flight: Recorded, path: Trajectory, earth: Earth) -> tuple[float, float] | None:
-    """Return how late [s] and how far off [m] the receiver's own positions are on the path.
-
-    It is the delay that the autopilot assumes, which need not be the true one. None: too few.
-    """
-    time_s, *place = flight.receiver[:, flight.receiver[1:].any(axis=0)]
-    at = path.at(time_s)
-    known = (at.speed_m_s > MOVING_M_S) & (time_s > path.time_s[0]) & (time_s < path.time_s[-1])
-    if known.sum() < LEAST_S:
-        return None
-    east_m, north_m = earth.to_local_all(*place)
-    late = np.concatenate((at.velocity_east_m_s[known], at.velocity_north_m_s[known]))
-    beside = np.kron(np.eye(2), np.ones((known.sum(), 1)))
-    off_m = np.concatenate(((at.east_m - east_m)[known], (at.north_m - north_m)[known]))
-    behind_s, *apart_m = np.linalg.lstsq(np.column_stack((late, beside)), off_m, rcond=None)[0]
-    return float(behind_s), float(np.hypot(*apart_m))
+def receiver_of(flight: Recorded) -> ReceiverOffset | None:
+    """Return how late and how far off the receiver's own positions are; None: not known."""
+    states, place = flight.states, flight.receiver[1:].any(axis=0)
+    fixed_s, latitude_deg, longitude_deg = flight.receiver[:, place].tolist()
+    told = (states[COLUMNS[i]].tolist() for i in (0, 0, 1, 2, 4, 5))
+    fixes = (held(flight.fixes, at_s, 0) for at_s in fixed_s)
+    return offset_of(
+        zip(*told, strict=True),
+        zip(fixed_s, fixes, fixed_s, latitude_deg, longitude_deg, strict=True),
+    )
 
 
 def held(told: Held, now_s: float, default: Any) -> Any:

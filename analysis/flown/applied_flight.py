@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from analysis.flight_record import Spans
 from companion.core.setup import Setup
 from companion.journal.writer import Event
+from companion.receiver import ReceiverOffset
 from companion.simulated import Simulated, simulated_in
 
 Floats = NDArray[np.float64]
@@ -86,6 +87,7 @@ class AppliedFlight:
     wind_m_s: Series | None = None
     wind_from_deg: Series | None = None
     fix: Series | None = None
+    receiver: ReceiverOffset | None = None
     unknown: tuple[Spans, ...] = ()
 
     @property

@@ -220,7 +220,7 @@ def flight_of(
     time_s, target, flow, speed, course, heading, height = applied.columns
     latitude_deg, longitude_deg = applied.place["lat"].copy(), applied.place["lon"].copy()
     east_m, north_m = setup.frame.to_local_all(latitude_deg.tolist(), longitude_deg.tolist())
-    sensors = sensors_of(journal, names, unread, is_sound=is_sound)
+    sensors, receiver = sensors_of(journal, names, unread, is_sound=is_sound)
     events = _events(journal, unread)
     changes, missing = read_changes(journal, len(setup.boom.valves), names, unread)
     flight = AppliedFlight(
@@ -254,6 +254,7 @@ def flight_of(
         wind_m_s=sensors["WindReport"],
         wind_from_deg=sensors[WIND_FROM],
         fix=sensors["GnssReport"],
+        receiver=receiver,
     )
     return _mended(flight, applied.holes, missing, unread)
 

@@ -36,13 +36,15 @@ from analysis.journals.unpacking import (
 )
 from companion.core.label import from_deg
 from companion.journal.rows import ANCHORED, BACK, BITS, FLOAT, NEW, SAME, Key, keys_of
+from companion.receiver import offset_of
 
 if TYPE_CHECKING:
     from analysis.journals.unpacking import Entry
     from companion.journal.codec import FieldNames
     from companion.journal.reader import OpenJournal
+    from companion.receiver import ReceiverOffset
 
-WIND_FROM = "wind from"
+WIND_FROM, TOLD, FIXED = "wind from", "Telemetry", "GnssReport"
 PARSED_AT_ONCE = 1000
 # Which value of which sensor's message becomes a series, and which field tells a fault.
 _SENSORS = {
@@ -50,27 +52,40 @@ _SENSORS = {
     "PressureReport": ("pressure_kpa", None),
     "TankReport": ("level_l", None),
     "WindReport": ("speed_m_s", None),
-    "GnssReport": ("fix", None),
+    FIXED: ("fix", None),
 }
+# What else is read of a message: where a wind blows to; place and velocity, whose receiver's delay
+# is found beside the estimator's.
+_MORE = {
+    "WindReport": ("east_m_s", "north_m_s"),
+    FIXED: ("boot_s", "latitude_deg", "longitude_deg"),
+    TOLD: (
+        "boot_s", "latitude_deg", "longitude_deg", "velocity_north_m_s", "velocity_east_m_s"
+    ),
+}  # fmt: skip
 
 
 def sensors_of(
     journal: OpenJournal, names: FieldNames, unread: list[str] | None, *, is_sound: bool
-) -> dict[str, Series | None]:
+) -> tuple[dict[str, Series | None], ReceiverOffset | None]:
     """Return the series of each kind of sensor's message, and of where the wind comes from.
 
-    None where there is no message. `is_sound` says that the packed rows are whole: then only their
-    numbers are read.
+    None where there is no message; and what the receiver differs by. `is_sound` says that the
+    packed rows are whole: then only their numbers are read.
     """
     parts: dict[str, list[Floats]] = {kind: [] for kind in (*_SENSORS, WIND_FROM)}
-    blown = [names.get("WindReport", ()).index(name) for name in _blown_in(names)]
-    wanted = {kind: _wanted(kind, names) for kind in _SENSORS if kind in names}
+    heard: dict[str, list[Floats]] = {TOLD: [], FIXED: []}
+    wanted = {kind: _wanted(kind, names) for kind in (*_SENSORS, TOLD) if kind in names}
     try:
         for kind, rows in _numbers(journal, wanted, unread, is_sound=is_sound):
+            if kind in heard:
+                heard[kind].append(rows[:, :-1])
+            if kind == TOLD:
+                continue
             told = rows[:, 1].copy()
             told[rows[:, -1] != 0.0] = np.nan
             parts[kind].append(np.column_stack((rows[:, 0], told)))
-            if kind == "WindReport" and blown:
+            if kind == "WindReport" and _more_in(kind, names):
                 from_deg_s = [from_deg(*each) for each in rows[:, 2:4].tolist()]
                 parts[WIND_FROM].append(
                     np.column_stack((rows[:, 0], np.array(from_deg_s, dtype=np.float64)))
@@ -79,13 +94,17 @@ def sensors_of(
         if unread is None or "locked" in str(error):
             raise
         unread.append(f"what sensors said behind a damaged place: {' '.join(str(error).split())}")
-    return {kind: _series(rows) for kind, rows in parts.items()}
+    positions, fixes = (
+        [row for rows in heard[kind] for row in rows.tolist()] if _more_in(FIXED, names) else []
+        for kind in (TOLD, FIXED)
+    )
+    return {kind: _series(rows) for kind, rows in parts.items()}, offset_of(positions, fixes)
 
 
 def _wanted(kind: str, names: FieldNames) -> Wanted:
-    """Return the places of a sensor's time, value and fault; of wind where it blows to, too."""
-    value, fault = _SENSORS[kind]
-    numbers = ["received_s", value, *(_blown_in(names) if kind == "WindReport" else ())]
+    """Return the places of a sensor's time, value and fault, and of what else is read of it."""
+    value, fault = _SENSORS.get(kind, (None, None))
+    numbers = ["received_s", *filter(None, [value]), *_more_in(kind, names)]
     return Wanted(
         numbers=tuple(names[kind].index(name) for name in numbers),
         flag=names[kind].index(fault) if fault else -1,
@@ -109,10 +128,10 @@ def _numbers(
         yield from numbers_of([entry.body for entry in several], wanted).items()
 
 
-def _blown_in(names: FieldNames) -> tuple[str, ...]:
-    """Return the fields of where a wind blows to; none in journals that hold only its speed."""
-    wanted = ("east_m_s", "north_m_s")
-    return wanted if set(wanted) <= set(names.get("WindReport", ())) else ()
+def _more_in(kind: str, names: FieldNames) -> tuple[str, ...]:
+    """Return what else is read of a message; nothing in journals from before it was kept."""
+    wanted = _MORE.get(kind, ())
+    return wanted if set(wanted) <= set(names.get(kind, ())) else ()
 
 
 def _several(entries: Iterator[Entry]) -> Iterator[list[Entry]]:

@@ -364,6 +364,7 @@ def warnings_of(
         *held_ground(assessment),
         *_wishes(flight, clock),
         *_wind(flight),
+        *_receiver(flight),
         *_flow(assessment, why_not_evaluated),
         *record_warnings(records),
     ]
@@ -422,6 +423,13 @@ def _wind(flight: AppliedFlight) -> Iterator[Caution]:
     if note:
         fix = "Measure it on the ground and give it (application.wind_m_s)."
         yield _note("wind-unknown", f"{note[0].upper()}{note[1:]}. {fix}")
+
+
+def _receiver(flight: AppliedFlight) -> Iterator[Caution]:
+    if flight.receiver is not None:
+        severity: Severity = "warning" if flight.receiver.is_unusual else "note"
+        words = flight.receiver.words
+        yield Caution(severity=severity, code="receiver", text=f"{words[0].upper()}{words[1:]}.")
 
 
 def _inhibited(

@@ -27,6 +27,7 @@ from companion.errors import ConfigError
 from companion.journal.journal import Journal
 from companion.link.vehicle_link import VehicleLink
 from companion.ports import Recorder
+from companion.receiver import MEMORY_FIXES, ReceiverWatch
 from companion.web import Obey, OperatorPage, Order, Outcome, listen, map_object
 from companion.web.guard import Doors, Tokens, is_loopback, kept_tokens, new_tokens
 from companion.web.page import number
@@ -279,11 +280,13 @@ class Watched:
     def __init__(self, journal: Recorder, page: OperatorPage) -> None:
         self._journal, self._page = journal, page
         self.satellites: int | None = None
+        self.receiver = ReceiverWatch(MEMORY_FIXES)
 
     def record_input(self, item: Input) -> None:
         """Take down one input."""
         if isinstance(item, GnssReport):
             self.satellites = item.satellites
+        self.receiver.take(item)
         self._journal.record_input(item)
 
     def record_coverage(self, coverage: Coverage) -> None:
@@ -308,7 +311,7 @@ def watched(page: OperatorPage, journal: Journal, link: VehicleLink) -> Recorder
 
     def extras() -> dict[str, Any]:
         statistics, clock = link.statistics, link.component.clock
-        free_bytes = journal.free_bytes
+        free_bytes, receiver = journal.free_bytes, both.receiver.offset
         found: dict[str, Any] = {
             "journal": {
                 "fault": journal.fault,
@@ -319,6 +322,12 @@ def watched(page: OperatorPage, journal: Journal, link: VehicleLink) -> Recorder
             },
             "tank_counted_l": None if link.tank_l is None else round(link.tank_l, 2),
             "satellites": both.satellites,
+            "receiver": receiver
+            and {
+                "late_s": number(receiver.late_s, 3),
+                "off_m": number(receiver.off_m),
+                "is_usual": not receiver.is_unusual,
+            },
             "clock": {
                 "answers": clock.is_known,
                 "round_trip_s": number(clock.round_trip_s, 4),

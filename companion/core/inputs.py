@@ -88,12 +88,19 @@ class ImuReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GnssReport:
-    """Quality of the GNSS fix (GPS_RAW_INT)."""
+    """Quality of the GNSS fix (GPS_RAW_INT).
+
+    Its stamp by the autopilot's clock and its place are for `companion/receiver.py`: nothing is
+    decided by them.
+    """
 
     received_s: float
     fix: Fix
     horizontal_accuracy_m: float | None = None
     satellites: int | None = None
+    boot_s: float | None = None
+    latitude_deg: float | None = None
+    longitude_deg: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

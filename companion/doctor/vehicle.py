@@ -34,12 +34,10 @@ from companion.link.streams import ENOUGH
 from companion.link.vehicle_link import VehicleLink
 from companion.output.autopilot_guard import more_parameters, wanted_parameters
 from companion.output.autopilot_options import ServoOptions, ardupilot_places
+from companion.receiver import ReceiverOffset, ReceiverWatch
 
 # Farther from the map than a take-off place is: another field, or a datum that is wrong.
 MAP_MAX_M = 2_000.0
-# On the ground an estimate farther from an RTK receiver is wrong, or the antenna's place is.
-RECEIVER_OFF_MAX_M = 0.3
-M_PER_DEG = 111_195.0
 _VEHICLE = (
     "heartbeat", "disarmed", "streams", "vehicle-clock", "fix", "estimator", "place", "rc-switch",
     "wind",
@@ -151,14 +149,15 @@ def _estimator(heard: Heard) -> Check:
     if not heard.is_estimator_healthy:
         fix = "wait for it to settle, or calibrate compass and accelerometers"
         return fail("estimator", "the autopilot does not trust its own position", fix)
-    off_m = heard.receiver_off_m
-    if heard.fix is not None and heard.fix >= Fix.RTK_FLOAT and off_m is not None:
-        text = f"its position is {off_m:.2f} m from the RTK receiver's"
-        if heard.is_armed is False and not off_m <= RECEIVER_OFF_MAX_M:
-            fix = "wait, or correct the antenna's place (GPS_POS1_X, EKF2_GPS_POS_X)"
-            return warn("estimator", text, fix)
-        return ok("estimator", f"healthy, {text}")
-    return ok("estimator", "healthy")
+    if heard.receiver is None:
+        return ok("estimator", "healthy")
+    if heard.receiver.is_unusual:
+        fix = (
+            "wait, or correct the antenna's place (GPS_POS1_X, EKF2_GPS_POS_X) and the receiver's "
+            "delay (GPS1_DELAY_MS, EKF2_GPS_DELAY)"
+        )
+        return warn("estimator", heard.receiver.words, fix)
+    return ok("estimator", f"healthy; {heard.receiver.words}")
 
 
 def _place(heard: Heard, setup: Setup | None) -> Check:
@@ -273,7 +272,7 @@ class Heard:
     fix: Fix | None = None
     accuracy_m: float | None = None
     is_estimator_healthy: bool | None = None
-    receiver_off_m: float | None = None
+    receiver: ReceiverOffset | None = None
     position: Position | None = None
     rc_pulse_us: tuple[int, ...] = ()
     has_wind: bool = False
@@ -322,6 +321,7 @@ class VehicleListener:
         self.met_s: float | None = None
         self._last: dict[type[Input], Input] = {}
         self.results: list[int] = []
+        self.receiver = ReceiverWatch()
 
     def met(self, is_px4: bool) -> Sequence[str]:
         """Take that the vehicle was met; return the parameters to read of it."""
@@ -367,9 +367,10 @@ class VehicleListener:
         return found
 
     def take(self, inputs: Sequence[Input]) -> None:
-        """Keep the last of each kind."""
+        """Keep the last of each kind, and what a receiver differs by."""
         for item in inputs:
             self._last[type(item)] = item
+            self.receiver.take(item)
 
     def latest(self, kind: type[T]) -> T | None:
         """Return the last of a kind."""
@@ -470,16 +471,6 @@ def _may_order(listener: VehicleListener) -> bool:
     return heartbeat is not None and not heartbeat.armed and not listener.is_px4
 
 
-def _apart_m(position: Telemetry | None, receiver: tuple[float, float] | None) -> float | None:
-    if position is None or receiver is None:
-        return None
-    north_deg = receiver[0] - position.latitude_deg
-    east_deg = receiver[1] - position.longitude_deg
-    return M_PER_DEG * math.hypot(
-        north_deg, east_deg * math.cos(math.radians(position.latitude_deg))
-    )
-
-
 def _heard(
     link: VehicleLink,
     listener: VehicleListener,
@@ -507,7 +498,7 @@ def _heard(
         if position is None
         else Position(latitude_deg=position.latitude_deg, longitude_deg=position.longitude_deg),
         rc_pulse_us=() if rc is None else rc.pulse_us,
-        receiver_off_m=_apart_m(position, link.component.codec.receiver),
+        receiver=listener.receiver.offset,
         has_wind=wind is not None and wind.speed_m_s is not None,
         wind_m_s=None if wind is None else wind.speed_m_s,
         wind_from_deg=wind_from_deg(wind),

@@ -47,7 +47,7 @@ __all__ = ["AUTOPILOT_COMPONENT", "Codec", "Vehicle"]
 
 Accept = Callable[[bytes, int], bool]
 
-_HEARTBEAT, _GPS_RAW_INT = 0, 24
+_HEARTBEAT = 0
 _HIL_ENABLED = 32  # MAV_MODE_FLAG_HIL_ENABLED
 _SENDERS_MAX = 64
 # So many frames in a row that seem overtaken, and their sender has begun to count anew.
@@ -99,8 +99,6 @@ class Codec:
         self.vehicle_frame_count = 0
         # Whether the vehicle's last heartbeat spoke of hardware in the loop of a simulation.
         self.is_hil = False
-        # Where the receiver itself says that the vehicle is, in degrees.
-        self.receiver: tuple[float, float] | None = None
 
     @property
     def vehicle(self) -> Vehicle | None:
@@ -186,8 +184,6 @@ class Codec:
             return None
         if message_id == _HEARTBEAT:
             self.is_hil = bool(raw.base_mode & _HIL_ENABLED)
-        elif message_id == _GPS_RAW_INT and raw.lat:
-            self.receiver = (raw.lat / 1e7, raw.lon / 1e7)
         return FROM_VEHICLE[message_id](raw, received_s)
 
     def _count(self, sender: tuple[int, int], number: int) -> bool:
@@ -256,11 +252,17 @@ def _gnss(m: Any, received_s: float) -> GnssReport:
     known = Fix.FIX_3D if m.fix_type in (7, 8) else Fix.NONE
     fix = Fix(m.fix_type) if m.fix_type <= Fix.RTK_FIXED else known
     accuracy_m = m.h_acc / 1000.0 if m.h_acc else None
+    is_placed = fix >= Fix.FIX_2D and (m.lat or m.lon)
+    stamp_s = m.time_usec / 1e6
     return GnssReport(
         received_s=received_s,
         fix=fix,
         horizontal_accuracy_m=accuracy_m,
         satellites=None if m.satellites_visible == _UINT8_MAX else m.satellites_visible,
+        # A time of day is no time since boot.
+        boot_s=stamp_s if 0.0 < stamp_s < _UTC_MIN_S else None,
+        latitude_deg=m.lat / 1e7 if is_placed else None,
+        longitude_deg=m.lon / 1e7 if is_placed else None,
     )
 
 

@@ -184,6 +184,11 @@ class Autopilot:
             self._frozen = self._estimator.frozen(now_s)
         return self._frozen
 
+    def received(self, now_s: float) -> Pose:
+        """Return the receiver's last place, at its stamp."""
+        is_lost = self.faults.active(FaultKind.STALE_POSITION, now_s) is not None
+        return self.believed(now_s) if is_lost else self._estimator.fix(now_s)
+
     def leaning(self, now_s: float) -> Leaning:
         """Return how the copter truly leans, as its sensors have it."""
         world = self.flight.world

@@ -140,6 +140,9 @@ class Autopilot(Protocol):
     def believed(self, now_s: float) -> Pose:
         """Return the estimated pose; frozen and at rest while the estimator is lost."""
 
+    def received(self, now_s: float) -> Pose:
+        """Return the receiver's last place, at its stamp."""
+
     def leaning(self, now_s: float) -> Leaning:
         """Return how the copter truly leans, as its sensors have it."""
 

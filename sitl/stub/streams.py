@@ -108,12 +108,12 @@ def vfr_hud(autopilot: Autopilot, now_s: float) -> Message:
 
 def gps_raw(autopilot: Autopilot, now_s: float) -> Message:
     """Return GPS_RAW_INT: RTK fixed, unless a fault says otherwise."""
-    pose = autopilot.believed(now_s)
+    pose = autopilot.received(now_s)
     latitude_e7, longitude_e7 = _place_e7(autopilot, pose)
     drop = autopilot.faults.active(FaultKind.GPS_DROP, now_s)
     course_deg = math.degrees(math.atan2(pose.velocity_east_m_s, pose.velocity_north_m_s))
     return dialect.MAVLink_gps_raw_int_message(
-        int(autopilot.boot_ms(now_s)) * 1000,
+        autopilot.boot_ms(pose.time_s) * 1000,
         dialect.GPS_FIX_TYPE_RTK_FIXED if drop is None else drop.fix,
         latitude_e7,
         longitude_e7,

@@ -220,6 +220,10 @@ ARDUPILOT_NOISE = EstimatorNoise()
 PX4_NOISE = EstimatorNoise(lag_s=0.006, drift_m=0.1, drift_time_s=120.0)
 
 
+# How late a receiver is.
+RECEIVER_S = 0.1
+
+
 class Estimator:
     """Gives the estimated pose; the drift goes on between two looks."""
 
@@ -250,6 +254,10 @@ class Estimator:
             velocity_east_m_s=pose.velocity_east_m_s + float(off_m_s[0]),
             velocity_north_m_s=pose.velocity_north_m_s + float(off_m_s[1]),
         )
+
+    def fix(self, now_s: float) -> Pose:
+        """Return where the receiver says that the vehicle is now: it is late, as they are."""
+        return replace(self.estimate(now_s - RECEIVER_S), time_s=now_s)
 
     def frozen(self, now_s: float) -> Pose:
         """Return the last estimate at rest: what is sent once there is none any more."""

@@ -25,6 +25,7 @@ from analysis.flown.sensor_series import sensors_of
 from analysis.journals.content import read_journal
 from analysis.journals.unpacking import Part, checked
 from analysis.replay import replay
+from analysis.report import contents
 from companion.cli.app import execute
 from companion.errors import JournalError
 from companion.journal.codec import field_names_of
@@ -35,6 +36,7 @@ from sitl.flight import fly as simulate
 from sitl.fly import FlyOptions, prepare
 from sitl.vehicle import Vehicle
 from tests.analysis.test_replay import fly
+from tests.companion.test_receiver import to_and_fro, watched
 from tests.independent_figures import figures
 
 ANYANG = Path(__file__).parents[2] / "examples" / "anyang"
@@ -143,12 +145,32 @@ def test_a_damaged_journal_is_read_as_far_as_it_goes(flown: Flown, tmp_path: Pat
     assert len(flight.time_s) == len(flown.flight.time_s)
 
 
+@pytest.mark.parametrize(("off_m", "severity"), [(0.2, "note"), (0.6, "warning")])
+def test_a_receiver_beside_the_estimator_is_in_the_report(
+    off_m: float, severity: str, tmp_path: Path
+) -> None:
+    """From the journal alone; one of before the receiver's place was kept says nothing of it."""
+    task = prepare(FlyOptions(config=ANYANG / "config.toml", mission=ANYANG / "mission.waypoints"))
+    with Journal.create(tmp_path, setup=task.setup, started_s=0.0, waits=True) as journal:
+        for item in to_and_fro(0.09, off_m):
+            journal.record_input(item)
+    flight = read_applied(journal.path)
+    assert flight.receiver == watched(*to_and_fro(0.09, off_m))
+    (said,) = contents._receiver(flight)
+    assert said.severity == severity
+    assert f"90 ms, {off_m:.2f} m beside it" in said.text
+    with opened(journal.path) as kept:
+        names = dict(field_names_of(kept.meta["setup"]))
+        names["GnssReport"] = names["GnssReport"][:4]
+        assert sensors_of(kept, names, None, is_sound=False)[1] is None
+
+
 def test_sensors_of_a_sound_journal_are_the_same_without_texts(
     flown: Flown, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with opened(flown.journal) as journal:
         names = field_names_of(journal.meta["setup"])
-        wanted = sensors_of(journal, names, None, is_sound=False)
+        wanted, receiver = sensors_of(journal, names, None, is_sound=False)
         texts: list[int] = []
 
         def counted(crc: int, *rest: Any) -> Part:
@@ -156,11 +178,11 @@ def test_sensors_of_a_sound_journal_are_the_same_without_texts(
             return checked(crc, *rest)
 
         monkeypatch.setattr("analysis.flown.sensor_series.checked", counted)
-        found = sensors_of(journal, names, None, is_sound=True)
+        found, same = sensors_of(journal, names, None, is_sound=True)
         (blocks,) = journal.connection.execute("SELECT count(*) FROM blocks").fetchone()
     # A short block may be read by its texts: numbers of its columns can stand on each other.
     assert len(texts) < 0.5 * blocks
-    assert found.keys() == wanted.keys()
+    assert (found.keys(), same) == (wanted.keys(), receiver)
     assert found["FlowReport"] is not None
     for kind, series in wanted.items():
         own = found[kind]

@@ -156,6 +156,21 @@ def test_accuracy_and_satellites_that_were_not_sent_are_none() -> None:
     assert message.satellites is None
 
 
+def test_a_receivers_place_has_the_autopilots_stamp_or_none() -> None:
+    def told(time_us: int, fix_type: int, *place_e7: int) -> GnssReport:
+        found = one(frame("gps_raw_int", time_us, fix_type, *place_e7, 0, 0, 0, 0, 0, 12))
+        assert isinstance(found, GnssReport)
+        return found
+
+    placed = told(7_250_000, 6, 361_000_000, 1_145_000_000)
+    assert (placed.boot_s, placed.latitude_deg, placed.longitude_deg) == (7.25, 36.1, 114.5)
+    # A time of day, or none; a receiver without a fix, and one that stands at zero.
+    assert told(1_764_000_000_000_000, 6, 361_000_000, 0).boot_s is None
+    assert told(0, 6, 361_000_000, 0).boot_s is None
+    assert told(7_250_000, 1, 361_000_000, 0).latitude_deg is None
+    assert told(7_250_000, 6, 0, 0).longitude_deg is None
+
+
 HEALTHY = 1 | 2 | 4 | 16 | 32
 
 

@@ -19,6 +19,7 @@ from companion.doctor.gpio import Chip, Line, gpio_checks, read_chip, read_regis
 from companion.doctor.vehicle import Heard, Position, Rate, link_checks, no_link
 from companion.output.autopilot_options import DriveOutput, ServoOptions
 from companion.output.engine.wire import Wiring
+from companion.receiver import ReceiverOffset
 from missions.maps.compiling import compiled_setup
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "anyang"
@@ -83,6 +84,10 @@ def rated(name: str, rate_hz: float) -> Heard:
     return replace(GOOD, rates=(Rate(name=name, wanted_hz=20.0, rate_hz=rate_hz),))
 
 
+def off(off_m: float, late_s: float | None = None) -> ReceiverOffset:
+    return ReceiverOffset(late_s=late_s, off_m=off_m, is_rtk=True)
+
+
 @pytest.mark.parametrize(
     ("heard", "name", "status"),
     [
@@ -98,9 +103,11 @@ def rated(name: str, rate_hz: float) -> Heard:
         (replace(GOOD, fix=None), "fix", Status.FAIL),
         (replace(GOOD, fix=Fix.FIX_3D), "fix", Status.FAIL),
         (replace(GOOD, is_estimator_healthy=None), "estimator", Status.WARN),
-        (replace(GOOD, receiver_off_m=0.25), "estimator", Status.OK),
-        (replace(GOOD, receiver_off_m=0.6), "estimator", Status.WARN),
-        (replace(GOOD, receiver_off_m=NAN), "estimator", Status.WARN),
+        (replace(GOOD, receiver=off(0.25)), "estimator", Status.OK),
+        (replace(GOOD, receiver=off(0.6)), "estimator", Status.WARN),
+        (replace(GOOD, receiver=off(NAN)), "estimator", Status.WARN),
+        (replace(GOOD, receiver=off(0.1, 0.08)), "estimator", Status.OK),
+        (replace(GOOD, receiver=off(0.1, 0.3)), "estimator", Status.WARN),
         (replace(GOOD, is_estimator_healthy=False), "estimator", Status.FAIL),
         (replace(GOOD, position=None), "place", Status.FAIL),
         (
@@ -123,14 +130,6 @@ def test_each_fact_of_the_vehicle_has_its_verdict(heard: Heard, name: str, statu
     assert checks[name].status is status
     others = {check.status for other, check in checks.items() if other not in (name, "wind")}
     assert others == {Status.OK}
-
-
-def test_only_rtk_on_the_ground_says_that_the_estimate_is_off() -> None:
-    # Without RTK the receiver is no better; in flight it is late.
-    for heard in (replace(GOOD, fix=Fix.DGPS), replace(GOOD, is_armed=True)):
-        assert of_link(replace(heard, receiver_off_m=0.6))["estimator"].status is Status.OK
-    found = of_link(replace(GOOD, receiver_off_m=0.6))["estimator"]
-    assert "0.60 m from the RTK receiver's" in found.text
 
 
 def test_wind_counts_where_it_is_required() -> None:

@@ -31,6 +31,7 @@ from companion.core.types import (
     Telemetry,
     WindReport,
 )
+from companion.journal.codec import encode
 from companion.link.component import Component, ComponentOptions
 from companion.link.parameters import Parameters, known_parameters
 from tests.bench.fuzz import fuzz
@@ -485,6 +486,29 @@ def decided(*items: Input, now_s: float = NOW_S) -> Decision:
     for item in items:
         track = observe(track, item, ALL_GATES)
     return step(ALL_GATES, estimate(track, now_s), Memory(), now_s)[0]
+
+
+def decisions(**receiver: float) -> list[str]:
+    """Return a flight's decisions, whose receiver tells a stamp and a place of its own."""
+    track, memory, made = Track(), Memory(), []
+    wish = OperatorCommand(received_s=10.0, enable=True, source="command")
+    for number in range(80):
+        now_s = 10.0 + number * 0.05
+        for item in [*healthy(now_s), *([wish] if number == 5 else []), telemetry(now_s)]:
+            told = replace(item, **receiver) if isinstance(item, GnssReport) else item
+            track = observe(track, told, ALL_GATES)
+        decision, memory = step(ALL_GATES, estimate(track, now_s), memory, now_s)
+        made.append(encode(decision))
+    return made
+
+
+def test_the_receivers_own_stamp_and_place_decide_nothing() -> None:
+    """They show the delay that the autopilot assumes, which nobody measured."""
+    without = decisions()
+    assert any("TimedChange" in each for each in without)
+    for value in (0.0, 36.0, 1e9, NAN, -INF):
+        told = decisions(boot_s=value, latitude_deg=value, longitude_deg=value)
+        assert told == without
 
 
 # What no gate rests on: it is information, or it has another that stands in for it.

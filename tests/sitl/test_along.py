@@ -21,7 +21,6 @@ from sitl.along import (
     METHODS,
     AlongOptions,
     Bed,
-    _receiver,
     along_lines,
     figures_of,
     fly_along,
@@ -32,7 +31,7 @@ from sitl.anyang import EXAMPLE
 from sitl.earth import Earth
 from sitl.fly_files import _draw_share
 from sitl.follow import Told, along
-from sitl.recorded import paths_of, read_flight, receiver_behind
+from sitl.recorded import paths_of, read_flight, receiver_of
 from sitl.serve import Following, Step
 from sitl.stub.protocol import dialect
 from tests import flown_logs
@@ -189,53 +188,28 @@ def test_how_late_and_how_far_off_a_receiver_is_against_the_estimate(log: Path) 
     at_s = np.arange(path.time_s[0], path.time_s[-1], 0.2)
     late = path.at(at_s - 0.08)
     place = flown_logs.HOME.to_geographic_all(late.east_m + 0.3, late.north_m - 0.4)
-    heard = replace(flight, receiver=np.array([at_s, *place]))
-    found = receiver_behind(heard, path, flown_logs.HOME)
+    found = receiver_of(replace(flight, receiver=np.array([at_s, *place])))
     assert found is not None
-    assert found[0] == pytest.approx(0.08, abs=0.004)
-    assert found[1] == pytest.approx(0.5, abs=0.02)
+    assert found.late_s == pytest.approx(0.08, abs=0.005)
+    assert found.off_m == pytest.approx(0.5, abs=0.02)
     # Telemetry stamps a fix by the autopilot's clock; a time of day is no such stamp.
-    found = receiver_behind(flight, path, flown_logs.HOME)
+    found = receiver_of(flight)
     assert found is not None
-    assert found[0] == pytest.approx(flown_logs.BEHIND_S, abs=0.01)
-    assert found[1] < 0.05
-
-
-@pytest.mark.parametrize(
-    ("late_s", "off_m", "fix", "is_unusual"),
-    [
-        (0.08, 0.25, 6, False),
-        (0.01, 0.0, 6, True),
-        (0.3, 0.0, 6, True),
-        (-0.08, 0.0, 6, True),
-        (0.08, 0.4, 5, True),
-        (0.08, 0.4, 3, False),
-        (0.08, 0.6, 3, True),
-    ],
-)
-def test_an_unusual_delay_or_offset_of_a_receiver_is_said(
-    late_s: float, off_m: float, fix: int, is_unusual: bool, log: Path
-) -> None:
-    flight = replace(read_flight(log), fixes=[(100.0, fix)])
-    (text,) = _receiver(flight, (late_s, off_m))
-    assert "the delay the autopilot assumes" in text
-    assert ("UNUSUAL" in text) is is_unusual
+    assert found.late_s == pytest.approx(flown_logs.BEHIND_S, abs=0.01)
+    assert found.off_m < 0.05
 
 
 @needs_logs
 def test_what_a_ground_station_heard_tells_it_too() -> None:
     """Positions at 1 Hz and a receiver of 2018, for which ArduPilot assumes more."""
-    flight = read_flight(LOGS / "phoenix-mission1.tlog")
-    states = flight.states
-    earth = Earth(float(states.latitude_deg[0]), float(states.longitude_deg[0]))
-    found = receiver_behind(flight, paths_of(flight, earth)[0], earth)
+    found = receiver_of(read_flight(LOGS / "phoenix-mission1.tlog"))
     assert found is not None
-    assert found[0] == pytest.approx(0.2, abs=0.06)
-    assert found[1] < 0.5
+    assert found.late_s == pytest.approx(0.2, abs=0.06)
+    assert found.off_m < 0.5
 
 
 @needs_logs
-@pytest.mark.parametrize(("name", "late_ms"), [("q116", 88), ("q130", 58), ("q083", 102)])
+@pytest.mark.parametrize(("name", "late_ms"), [("q116", 91), ("q130", 59), ("q083", 103)])
 def test_receivers_of_real_flights_are_behind_their_estimates(name: str, late_ms: int) -> None:
     notes = " ".join(prepare(AlongOptions(log=LOGS / f"{name}.BIN")).notes)
     assert f"measured one): {late_ms} ms" in notes
@@ -362,7 +336,8 @@ def test_the_stub_follows_a_flight_with_its_states_and_modes(log: Path) -> None:
     operator = Following(bench.autopilot, motions, start_s=bench.now_s)
     bench.companion.say(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
     position = dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT
-    bench.companion.command(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, position, 100_000.0)
+    for message in (position, dialect.MAVLINK_MSG_ID_GPS_RAW_INT):
+        bench.companion.command(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, message, 100_000.0)
     while operator.step is not Step.DONE:
         assert bench.now_s < 1100.0
         bench.run(0.02)
@@ -380,6 +355,16 @@ def test_the_stub_follows_a_flight_with_its_states_and_modes(log: Path) -> None:
     ):
         wanted = np.interp(at_s, states.time_s, states[name])
         assert np.abs(np.array(values) - wanted).max() < 3e-7
+    # The receiver's places come at their own stamps.
+    rows = {round(row[0], 3): row[1:] for row in flight.receiver.T.tolist()}
+    fixes = [m for m in bench.companion.of("GPS_RAW_INT") if 0.3 < m.at_s - start_s < length_s]
+    assert len(fixes) > 10
+    boot_s = np.median([m.at_s - m.time_boot_ms / 1e3 for m in told])
+    for m in fixes:
+        log_s = m.time_usec / 1e6 + boot_s - start_s + states.time_s[0]
+        nearest = min(rows, key=lambda each: abs(each - log_s))
+        assert nearest == pytest.approx(log_s, abs=0.003)
+        assert (m.lat * 1e-7, m.lon * 1e-7) == pytest.approx(rows[nearest], abs=2e-7)
     beats = [m for m in bench.companion.of("HEARTBEAT") if 1.1 < m.at_s - start_s < length_s - 0.1]
     assert {m.custom_mode for m in beats} == {flown_logs.AUTO}
     assert all(m.base_mode & 128 for m in beats)

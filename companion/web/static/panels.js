@@ -121,6 +121,8 @@ export function showLinks(state, facts, pageAge) {
     ["Autopilot's clock", Boolean(state.clock?.answers), state.clock ? (state.clock.answers ? "TIMESYNC" : "by arrival") : "–", state.clock?.round_trip_s ? `round trip ${Math.max(Math.round(state.clock.round_trip_s * 1000), 1)} ms` : ""],
     ["Record", Boolean(journal.name) && !journal.fault && !journal.lost, journal.fault ? "fault" : journal.lost ? `${journal.lost} rows lost` : journal.saved_age_s === undefined ? "writing" : calm(journal.saved_age_s), [journal.name, journal.free_gb === null || journal.free_gb === undefined ? "" : `${journal.free_gb < 10 ? journal.free_gb.toFixed(1) : Math.round(journal.free_gb)} GB free`].filter(Boolean).join(", ")],
   ];
+  const receiver = state.receiver;
+  if (receiver) items.push(["Receiver", receiver.is_usual, receiver.late_s === null ? "" : `${Math.round(receiver.late_s * 1000)} ms behind`, `${receiver.off_m === null ? "–" : receiver.off_m.toFixed(2)} m beside the estimator${receiver.late_s === null ? "" : "; the delay that the autopilot assumes"}`]);
   if (facts.has_meter) items.push(["Flow meter", !state.liquid?.meter_fault && state.liquid?.meter_ml !== null, state.liquid?.meter_fault ? "fault" : calm(state.liquid?.meter_age_s), state.liquid?.meter_fault ?? ""]);
   list("links", items, ([name, isOk, number, note]) => {
     const item = make("li", undefined, isOk ? "ok" : "bad");
