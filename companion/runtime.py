@@ -18,6 +18,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Coroutine, Iterator, Sequence
+from concurrent.futures import Future
 from typing import Any, TypeVar
 
 from companion.core.controller import Memory, expected_coverage, step
@@ -284,11 +285,16 @@ class _Ending:
         self.wake = asyncio.Event()
         self.reason: str | None = None
         self.error: BaseException | None = None
+        # What still opens its parts, which may take its time: a stop does not wait for it.
+        self.opening: asyncio.Task[Any] | None = None
 
     def end(self, reason: str) -> None:
         """End for `reason`; the first one counts."""
         self.reason = self.reason or reason
         self.wake.set()
+        opening, self.opening = self.opening, None
+        if opening is not None:
+            opening.cancel()
 
     def failed(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         """Take an exception that left a callback: nothing that runs here may fail unnoticed."""
@@ -330,6 +336,7 @@ async def run(
     """
     taken = recorder if recorder is not None else NoRecorder()
     ending = _Ending()
+    ending.opening = asyncio.current_task()
     control: ControlLoop | None = None
     with _ends_at_signals(ending):
         try:
@@ -357,11 +364,17 @@ async def run(
                         required=required,
                         commit_every_s=commit_every_s,
                     )
+                    ending.opening = None
                     await _turn_until_the_end(control, ending, duration_s, on_step, watch)
                 finally:
                     await executor.stop()
                     if control is not None:
                         control.ended()
+        except asyncio.CancelledError:
+            if ending.error is not None:
+                raise ending.error from None
+            if ending.reason is None:
+                raise
         finally:
             await link.close()
             taken.record_event(clock(), "stop", ending.reason or "failure")
@@ -429,12 +442,30 @@ def _ends_at_signals(ending: _Ending) -> Iterator[None]:
         loop.set_exception_handler(before)
 
 
+class _Loop(asyncio.SelectorEventLoop):
+    """Its calls in threads, of a name server or of a map's reader, hold up no end."""
+
+    def run_in_executor(self, _: Any, func: Any, *args: Any) -> Any:  # type: ignore[override]
+        """Call in a thread of its own: for those of a pool the interpreter waits at its end."""
+        found: Future[Any] = Future()
+
+        def work() -> None:
+            found.set_running_or_notify_cancel()
+            try:
+                found.set_result(func(*args))
+            except BaseException as error:  # noqa: BLE001 - raised where it is awaited
+                found.set_exception(error)
+
+        threading.Thread(target=work, daemon=True).start()
+        return asyncio.wrap_future(found, loop=self)
+
+
 def precise_event_loop() -> asyncio.AbstractEventLoop:
     """Return an event loop whose timers are not rounded up to whole milliseconds.
 
     epoll's timeouts are (Python's `selectors.EpollSelector.select`); select's are microseconds.
     """
-    return asyncio.SelectorEventLoop(selectors.SelectSelector())
+    return _Loop(selectors.SelectSelector())
 
 
 def settle() -> None:

@@ -41,6 +41,8 @@ async def meanwhile(make: Callable[[], T], link: VehicleLink, executor: PlanExec
         made = making.result()
         await opening
     finally:
+        # Who is told to stop does not wait for the reader.
+        making.cancel()
         opening.cancel()
         await asyncio.gather(opening, making, return_exceptions=True)
     return made

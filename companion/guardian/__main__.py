@@ -3,8 +3,9 @@
 The first packet says what closed is, each later one how the vehicle is reached, with the link's
 file where that is another one. It orders all outputs closed every `ROUND_S`, from its start until
 the companion has taken note of that, and again as soon as no packet came for a lease, the socket
-has ended, or SIGTERM came. After the last two it goes on for `AFTER_S`, and ends. The word "end",
-which the companion says when it has closed everything itself, ends it at once.
+has ended, or SIGTERM or SIGABRT came (systemd's watchdog sends that to all of a service). After the
+last two it goes on for `AFTER_S`, and ends. The word "end", which the companion says when it has
+closed everything itself, ends it at once.
 """
 
 from __future__ import annotations
@@ -192,6 +193,8 @@ class Guardian:
                 packet, files, _, _ = socket.recv_fds(self._control, PACKET_MAX, 1)
             except BlockingIOError:
                 return True
+            except ConnectionResetError:
+                continue  # it has ended without reading us: what it said before is still there
             except OSError:
                 packet, files = b"", []
             self._is_gone = not packet
@@ -242,12 +245,14 @@ def main(file: int) -> None:
     os.set_blocking(waker, False)
     signal.set_wakeup_fd(waker, warn_on_full_buffer=False)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    for number in (signal.SIGTERM, signal.SIGHUP):
+    for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGABRT):
         signal.signal(number, lambda *_: None)
     stay()
     with socket.socket(fileno=file) as control:
         control.setblocking(True)
-        Guardian(control, wake).serve()
+        # A start that died before its first word has opened nothing.
+        if control.recv(1, socket.MSG_PEEK):
+            Guardian(control, wake).serve()
 
 
 if __name__ == "__main__":

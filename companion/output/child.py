@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import socket
 import subprocess
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, suppress
 
-KILL_MAX_S = 0.1
+KILL_MAX_S, LOOK_S = 0.1, 0.01
 # More than any packet.
 RECEIVE_MAX = 1 << 17
 _PACKETS_AT_ONCE = 64
 
 
 class Child:
-    """A child process and the socket to it. No threads and no shell; `reap` must be called."""
+    """A child process and the socket to it. No threads and no shell; `ended` must be awaited."""
 
     def __init__(self, command: Sequence[str]) -> None:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -75,13 +77,11 @@ class Child:
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(KILL_MAX_S)
 
-    def end(self, within_s: float) -> None:
-        """Wait for its end, and kill it where that does not come."""
-        try:
-            self._process.wait(within_s)
-        except subprocess.TimeoutExpired:
-            self.kill()
-
-    def reap(self) -> None:
-        """Wait for an end that is under way."""
-        self._process.wait()
+    async def ended(self, within_s: float) -> None:
+        """Wait for its end while all else goes on, and kill it where that does not come."""
+        until_s = time.monotonic() + within_s
+        while self._process.poll() is None:
+            if not time.monotonic() < until_s:
+                self.kill()
+                return
+            await asyncio.sleep(LOOK_S)

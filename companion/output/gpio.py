@@ -19,7 +19,7 @@ from typing import Any
 
 from companion.core.types import SprayPlan
 from companion.errors import ActuatorError
-from companion.output.child import Child
+from companion.output.child import KILL_MAX_S, Child
 from companion.output.engine.lines import Lines, open_lines
 from companion.output.engine.selftest import SelfTest
 from companion.output.engine.wire import (
@@ -178,7 +178,7 @@ class GpioExecutor:
                 self._held.take(asyncio.get_running_loop().time())
             self._disconnect()
             # It has closed its end or was killed: what is left of its end is short.
-            child.reap()
+            await child.ended(KILL_MAX_S)
             self._child = None
             _logger.info(
                 "%d edges, latest by %.1f ms, %d plans refused, %d leases ended, %d standstills",

@@ -158,7 +158,7 @@ class GuardedServoExecutor(ServoExecutor):
             if child is not None:
                 child.send(b'"end"')
                 child.disconnect()
-                child.end(SILENCE_MAX_S)
+                await child.ended(SILENCE_MAX_S)
 
     def _look(self) -> None:
         """Take what the guardian said; what it closed is to be ordered anew."""

@@ -589,4 +589,5 @@ async def _ended_within(child: subprocess.Popen[bytes], wait_s: float) -> None:
             return
         await asyncio.sleep(END_LOOK_S)
     child.kill()
-    child.wait()
+    with suppress(subprocess.TimeoutExpired):
+        child.wait(END_LOOK_S)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import shutil
+import signal
+import threading
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -158,6 +161,24 @@ async def test_word_that_an_earlier_guardian_left_is_told_once(tmp_path: Path) -
         assert found.said == []
 
 
+async def test_a_guardian_that_does_not_end_holds_up_nothing_else(guarded: Guarded) -> None:
+    await guarded.opens()
+    child = guarded.executor._child
+    assert child is not None
+    os.kill(child.pid, signal.SIGSTOP)
+    guarded.orders.clear()
+    stopping = asyncio.create_task(guarded.executor.stop())
+    await asyncio.sleep(0)
+    assert guarded.orders == [(9, 1000), (10, 1000)]
+    turns = 0
+    while not stopping.done():
+        # From the second closing on it waits for the guardian alone: for a second.
+        turns += len(guarded.orders) == 4
+        await asyncio.sleep(0.01)
+    assert turns > 5
+    assert child._process.returncode == -signal.SIGKILL
+
+
 # ----------------------------------------------------------------------------- before a map is read
 
 
@@ -219,6 +240,27 @@ async def test_a_map_that_cannot_be_read_leaves_nothing_open(tmp_path: Path) -> 
             await meanwhile(read, link, executor)
         assert asyncio.all_tasks() == {asyncio.current_task()}
     finally:
+        await executor.stop()
+        await link.close()
+
+
+async def test_who_is_told_to_stop_does_not_wait_for_the_map(tmp_path: Path) -> None:
+    link, executor = made(tmp_path / "anyang")
+    begun, goes_on = threading.Event(), threading.Event()
+
+    def read() -> bool:
+        begun.set()
+        return goes_on.wait(60.0)
+
+    try:
+        reading = asyncio.create_task(meanwhile(read, link, executor))
+        await asyncio.to_thread(begun.wait)
+        reading.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await reading
+        assert not goes_on.is_set()
+    finally:
+        goes_on.set()
         await executor.stop()
         await link.close()
 

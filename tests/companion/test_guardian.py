@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import pty
 import select
 import signal
 import socket
+import subprocess
 import time
 import tty
 from collections.abc import Iterator
@@ -158,7 +160,7 @@ def over(link: int, file: int, **options: Any) -> Iterator[Lone]:
     finally:
         one.child.kill()
         one.child.disconnect()
-        one.child.reap()
+        asyncio.run(one.child.ended(60.0))
 
 
 @contextmanager
@@ -211,7 +213,7 @@ def test_the_end_of_the_companion_closes_and_ends_it(tmp_path: Path) -> None:
         begun_s = time.monotonic()
         one.child.disconnect()
         assert closed(one.first()) == VALVES
-        one.child.end(AFTER_S + 3.0)
+        asyncio.run(one.child.ended(AFTER_S + 3.0))
         assert time.monotonic() - begun_s >= AFTER_S
     assert json.loads(note.read_text())["rounds"] >= AFTER_S / ROUND_S - 1
 
@@ -236,15 +238,44 @@ def test_its_last_word_ends_it_without_an_order(tmp_path: Path) -> None:
     with serial(note=tmp_path / "none") as (one, _):
         one.tell(taken=1)
         one.child.send(b'"end"')
-        one.child.reap()
+        asyncio.run(one.child.ended(60.0))
         assert frames(one.sent(0.0)) == []
     assert not (tmp_path / "none").exists()
 
 
-def test_sigterm_closes_and_no_note_of_the_companion_ends_that() -> None:
+def test_its_last_word_counts_though_the_companion_left_what_it_said() -> None:
+    """Linux then tells of the end first (ECONNRESET), and only afterwards hands over the word."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    wake, waker = os.pipe()
+    with ours, theirs:
+        ours.send(setup())
+        guardian = Guardian(theirs, wake)
+        theirs.send(b'[1, true, "start"]')
+        ours.send(b'"end"')
+        ours.close()
+        guardian.serve()
+    os.close(wake)
+    os.close(waker)
+    assert guardian.rounds == 0
+
+
+def test_a_start_that_died_before_its_first_word_leaves_no_traceback() -> None:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with theirs:
+        ours.close()
+        done = subprocess.run(
+            [*COMMAND, str(theirs.fileno())], pass_fds=[theirs.fileno()], capture_output=True,
+            timeout=60.0, check=False,
+        )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGABRT])
+def test_sigterm_closes_and_no_note_of_the_companion_ends_that(number: int) -> None:
+    """Systemd's watchdog ends all of a service by SIGABRT, a stop by SIGTERM."""
     with serial() as (one, _):
         one.tell(taken=1)
-        os.kill(one.child.pid, signal.SIGTERM)
+        os.kill(one.child.pid, number)
         assert closed(one.first()) == VALVES
         assert one.said() == (2, True)
         one.tell(taken=2)
@@ -287,7 +318,7 @@ def test_datagrams_go_to_every_peer_and_to_the_one_other_end() -> None:
         finally:
             one.child.kill()
             one.child.disconnect()
-            one.child.reap()
+            asyncio.run(one.child.ended(60.0))
 
 
 def test_a_link_that_is_down_is_let_go() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import os
 import re
@@ -107,7 +108,7 @@ def test_the_valve_engine_runs_nothing_of_it(hostile: Path) -> None:
         answer = child.socket.recv(PACKET_MAX)
     finally:
         child.disconnect()
-        child.reap()
+        asyncio.run(child.ended(60.0))
     assert not what_ran(hostile)
     assert unpack(answer)[0] is not Kind.READY  # it got as far as the chip that is not there
 

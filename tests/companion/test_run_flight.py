@@ -8,6 +8,8 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -365,6 +367,88 @@ async def test_a_link_that_does_not_open_is_closed_and_nothing_is_started() -> N
     with pytest.raises(BrokenPartError, match="open"):
         await flown(SETUP, link=scribe, executor=scribe)
     assert scribe.calls == ["open", "close"]
+
+
+class Stuck(Scribe):
+    """Something that takes long to open."""
+
+    def __init__(self, at: str) -> None:
+        super().__init__()
+        self.at, self.is_stuck = at, asyncio.Event()
+
+    async def _open(self, call: str) -> None:
+        self._note(call)
+        if call == self.at:
+            self.is_stuck.set()
+            await asyncio.Event().wait()
+
+    async def open(self, wake: Callable[[], None]) -> None:
+        await self._open("open")
+
+    async def start(self) -> None:
+        await self._open("start")
+
+
+class StuckSensor(Stuck):
+    async def open(self, wake: Callable[[], None]) -> None:
+        await self._open("sensor")
+
+    async def close(self) -> None:
+        self._note("sensor closed")
+
+    def read(self, now_s: float) -> list[Input]:
+        return []
+
+
+@pytest.mark.parametrize("at", ["open", "start", "sensor"])
+async def test_a_signal_does_not_wait_for_what_still_opens(at: str) -> None:
+    """A host that does not answer, an engine or a gauge that hangs: seconds each."""
+    scribe = StuckSensor(at) if at == "sensor" else Stuck(at)
+    link = Stuck(at) if at == "sensor" else scribe
+    task = asyncio.create_task(
+        flown(SETUP, link=link, executor=link, sensors=[scribe] if scribe is not link else [])
+    )
+    await scribe.is_stuck.wait()
+    os.kill(os.getpid(), signal.SIGTERM)
+    assert await task == 0
+    assert link.calls[-2:] == (["open", "close"] if at == "open" else ["stop", "close"])
+    assert scribe is link or scribe.calls == ["sensor", "sensor closed"]
+
+
+async def test_an_exception_in_a_callback_is_raised_though_something_still_opens() -> None:
+    scribe = Stuck("start")
+    task = asyncio.create_task(flown(SETUP, link=scribe, executor=scribe))
+    await scribe.is_stuck.wait()
+
+    def fail() -> None:
+        raise BrokenPartError
+
+    asyncio.get_running_loop().call_soon(fail)
+    with pytest.raises(BrokenPartError):
+        await task
+    assert scribe.calls[-2:] == ["stop", "close"]
+
+
+def test_no_end_waits_for_a_thread() -> None:
+    """A name server that does not answer, the reader of a large map."""
+    program = """
+import asyncio, threading
+from companion.runtime import execute
+
+async def main():
+    begun = threading.Event()
+    asyncio.ensure_future(asyncio.to_thread(lambda: (begun.set(), threading.Event().wait())))
+    assert await asyncio.to_thread(begun.wait)
+    try:
+        await asyncio.to_thread(int, "x")
+    except ValueError:
+        return await asyncio.to_thread(int, "7")
+
+print(execute(main))
+"""
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60.0, check=True)
+    assert (done.stdout, done.stderr) == ("7\n", "")
 
 
 async def test_the_signals_are_given_back_afterwards() -> None:

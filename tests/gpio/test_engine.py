@@ -189,7 +189,7 @@ def test_a_killed_engine_gives_its_lines_back_to_their_pull(chip: SimChip) -> No
     # Its valves are held shut by current, its return valve is open without.
     assert chip.levels(*range(VALVES), RETURN) == [1] * VALVES + [0]
     child.kill()
-    child.reap()
+    asyncio.run(child.ended(60.0))
     child.disconnect()
     assert chip.levels(*range(VALVES), RETURN) == [int(line == 3) for line in range(VALVES + 1)]
 
