@@ -151,7 +151,7 @@ def test_command_line_imports_other_packages_only_when_they_are_called() -> None
 def test_run_loads_what_every_flight_needs_and_no_more() -> None:
     _, _, files = house.loaded(ROOT, tries=1)
     assert len(files) <= 100
-    # 17,000 until Part 17, whose rules of motion, floods, guards, stamps and stops are in each flight.
+    # 17,000 until Part 17, whose rules of motion, floods, guards, stamps, stops are in each.
     assert sum(map(house.code_lines, files)) <= 17_950
     # Each of these is loaded by the configuration that switches it on.
     optional = {
