@@ -32,7 +32,8 @@ class Format:
     """A format; `make` is `module:function`, `shapes` what a row may be, the usual one first.
 
     `suffixes` choose it without its name, `also` only with it. With `has_units` it can be had in
-    other units than the recorded ones; others have units of their own.
+    other units than the recorded ones; others have units of their own. With `has_sorties` one file
+    holds a whole job.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Format:
     shapes: tuple[Shape, ...] = ("points",)
     has_units: bool = False
     has_rate: bool = True
+    has_sorties: bool = True
 
     def maker(self) -> Make:
         """Return the function that makes it, imported now."""
@@ -59,7 +61,7 @@ FORMATS = (
     Format(
         name="csv-samples", description="path and flow of each valve every 10 ms",
         make="csv_tables:make_samples", suffixes=(), also=(".csv",), shapes=("steps",),
-        has_rate=False,
+        has_rate=False, has_sorties=False,
     ),
     Format(
         name="geojson", description="points or swaths", make="geojson:make",
@@ -80,7 +82,7 @@ FORMATS = (
     ),
     Format(
         name="isoxml", description="ISO 11783-10 task data and time log", make="isoxml_task:make",
-        suffixes=(), also=("", ".zip"),
+        suffixes=(), also=("", ".zip"), has_sorties=False,
     ),
     Format(
         name="geoparquet", description="swaths or points", make="geoparquet:make",
@@ -93,7 +95,7 @@ FORMATS = (
     ),
     Format(
         name="mcap", description="messages for Foxglove and its kin", make="mcap_file:make",
-        suffixes=(".mcap",),
+        suffixes=(".mcap",), has_sorties=False,
     ),
 )  # fmt: skip
 # A terminal looks for a folder of this name.
@@ -145,7 +147,12 @@ RATE_HZ_MAX = 1000.0
 
 @app.command(epilog="Example: vrspray export flights/flight-0001.gpkg --out flight-0001.geojson")
 def export_journal(
-    journal: Annotated[Path, typer.Argument(help="Journal of a flight, such as flight-0001.gpkg.")],
+    journals: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="JOURNAL...", help="Journal of a flight; of a job, those of all its sorties."
+        ),
+    ],
     out: Annotated[Path, typer.Option(help="File to write; the suffix sets the format.")],
     name: Annotated[
         str | None,
@@ -185,20 +192,33 @@ def export_journal(
     _check_rate(form, rate_hz)
     _check_free(out, force=force)
     form.maker()  # what is not installed is said before the work
-    note(f"reading {journal}")
-    unread: list[str] = []
-    flight = _read(journal, unread)
+    if len(journals) > 1:
+        journals = _of_a_job(form, journals)
+    also: tuple[Source, ...] = ()
+    warnings: list[str] = []
+    for journal in journals[::-1]:
+        note(f"reading {journal}")
+        unread: list[str] = []
+        flight = _read(journal, unread)
+        source = Source(
+            flight=flight,
+            shape=chosen,
+            system=system,
+            rate_hz=rate_hz,
+            unread=tuple(unread),
+            also=also if journal is journals[0] else (),
+        )
+        also = (source, *also)
+        warnings += [*_warnings(flight), *(f"not read: {each}" for each in unread)]
+    if len({each.valve_names for each in also}) > 1:
+        raise ExportError("the sorties were flown with other valves; export each by itself")
     note(f"writing {out} ({form.name})")
-    source = Source(
-        flight=flight, shape=chosen, system=system, rate_hz=rate_hz, unread=tuple(unread)
-    )
     try:
         size = _write(source, form, out, force=force)
     except EvaluationError as error:
-        if not (unread or flight.lost):
+        if not warnings:
             raise
         raise _too_little(flight, unread) from error
-    warnings = [*_warnings(flight), *(f"not read: {each}" for each in unread)]
     result = {
         "out": str(out),
         "format": form.name,
@@ -212,6 +232,15 @@ def export_journal(
     for warning in warnings:
         note(f"warning: {warning}")
     raise typer.Exit(1 if warnings else 0)
+
+
+def _of_a_job(form: Format, journals: list[Path]) -> list[Path]:
+    """Return the journals in order of time; ExportError where a file holds one flight."""
+    from analysis.journals.jobs import one_job
+
+    if not form.has_sorties:
+        raise ExportError(f"{form.name} holds one flight; export each sortie by itself")
+    return [each.path for each in one_job(journals)]
 
 
 def _read(journal: Path, unread: list[str]) -> AppliedFlight:

@@ -68,7 +68,8 @@ def make_adapt(source: Source, out: Path) -> Content:
 
 
 def _fields(source: Source) -> list[_Field]:
-    return _swath_fields(source) if source.shape == "swaths" else _point_fields(source)
+    found = _swath_fields(source) if source.shape == "swaths" else _point_fields(source)
+    return [*found, _Field(name="sortie", unit="", values=source.sorties)] if source.also else found
 
 
 def _work_fields(rows: Swaths | Samples) -> list[_Field]:

@@ -12,8 +12,9 @@ are those of the strip along the path, at the times that the model of the flow g
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, cast
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 import shapely
@@ -410,3 +411,27 @@ def _stretches(strip: Strip, number: int) -> _Stretches:
         area_m2=swept_m2[last] - swept_m2[first],
         volume_ml=track.volume_ml[last] - track.volume_ml[first],
     )
+
+
+_Rows = TypeVar("_Rows", Samples, Swaths)
+
+
+def joined(parts: Sequence[_Rows]) -> _Rows:
+    """Return the rows of all sorties, one after the other, by the clock of the first."""
+    first: Any = parts[0]
+
+    def together(name: str) -> Any:
+        values: list[Any] = [getattr(each, name) for each in parts]
+        if name in ("start_s", "end_s"):
+            offsets_s = [getattr(each, "utc_offset_s", 0.0) for each in parts]
+            values = [
+                its + at_s - offsets_s[0] for its, at_s in zip(values, offsets_s, strict=True)
+            ]
+        if any(each is None for each in values) or name == "utc_offset_s":
+            return values[0] if name == "utc_offset_s" else None
+        if isinstance(values[0], np.ndarray):
+            return np.concatenate(values)
+        return sum(values[1:], values[0])
+
+    found: _Rows = replace(first, **{each.name: together(each.name) for each in fields(first)})
+    return found

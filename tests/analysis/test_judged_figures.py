@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
+import pyogrio
 import pytest
 import shapely
 
 from analysis.assess.assessment import Assessment, assess, together
 from analysis.assess.ground import Treated, treated_of
+from analysis.exports.cli import export
+from analysis.exports.output import ExportError
 from analysis.exports.source import Source
 from analysis.flown.read_applied import read_applied
 from analysis.report.build import Report, ReportOptions, build_report
@@ -215,8 +220,17 @@ class Job:
         return {"abs": AREA * self.verdict.field_m2}
 
 
-# The first of its tests flies three sorties.
+# The first of a fixture's tests flies up to three sorties.
 pytestmark = pytest.mark.timeout(300)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def at_full_priority() -> Iterator[None]:
+    """Run commands as on a computer with no flight, and fly no twin of perfect knowledge."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("companion.cli.app.give_way", lambda *_: None)
+        patch.setattr("sitl.fly._perfect", lambda *_: None)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -294,3 +308,44 @@ def test_the_doses_of_a_job_are_sums_over_its_sorties(job: Job) -> None:
 
 def treated(job: Job) -> Treated:
     return treated_of(*(each.assessed.flight for each in job.flights))
+
+
+@pytest.mark.parametrize("name", ["job.geojson", "job.shp", "job.kml", "job.parquet"])
+def test_one_file_has_the_ground_and_litres_of_all_sorties(
+    job: Job, name: str, tmp_path: Path
+) -> None:
+    out = tmp_path / name
+    shape = [] if name in ("job.kml", "job.parquet") else ["--geometry", "swaths"]
+    # In any order.
+    execute(["export", *map(str, job.journals[::-1]), "--out", str(out), *shape])
+    layer = "applied" if out.suffix == ".kml" else None
+    if out.suffix == ".parquet":
+        table = pq.read_table(out)
+        rows = {each: np.array(table[each].to_pylist()) for each in table.column_names}
+        volume_ml, sortie = 1e3 * rows["AppliedTotalVolume"], rows["sortie"]
+        ground, times = rows["geometry"], rows["timestamp"]
+    else:
+        meta, _, ground, values = pyogrio.raw.read(out, layer=layer)
+        rows = dict(zip(map(str.lower, meta["fields"]), values, strict=True))
+        volume_ml = rows["volume_ml"] if "volume_ml" in rows else rows["volume"]
+        sortie, times = rows["sortie"], rows.get("time_utc", rows.get("isotime"))
+    assert volume_ml.sum() / 1e3 == pytest.approx(job.verdict.applied_l, rel=LITRES)
+    for number, flight in enumerate(job.flights, start=1):
+        its = sortie.astype(str) == str(number)
+        assert volume_ml[its].sum() / 1e3 == pytest.approx(flight.verdict.applied_l, rel=LITRES)
+        assert str(min(times[its]))[:16] <= flight.contents["flight"]["spraying_from"][:16]
+    origin_deg = job.flights[0].truth.origin_deg
+    shapes = [
+        shapely.transform(each, lambda xy: to_local(xy, origin_deg))
+        for each in shapely.from_wkb(ground)
+    ]
+    area = shapely.union_all(shapely.make_valid(shapes)).area
+    # Swaths reach as far as anything came out.
+    assert area == pytest.approx(job.verdict.treated_m2, abs=2 * AREA * job.verdict.field_m2)
+
+
+def test_what_holds_one_flight_refuses_a_job(job: Job, tmp_path: Path) -> None:
+    for words in (["--out", "TASKDATA"], ["--out", "a.csv", "--format", "csv-samples"]):
+        out = str(tmp_path / words[1])
+        with pytest.raises(ExportError, match="holds one flight; export each sortie by itself"):
+            export.main([*map(str, job.journals), "--out", out, *words[2:]], standalone_mode=False)
