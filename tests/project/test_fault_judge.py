@@ -307,6 +307,17 @@ def test_what_stood_open_during_a_stop_was_ordered_by_nobody() -> None:
     assert judge(replace(flight, own=[late], openings=[late])).ml > 1.0
 
 
+@pytest.mark.parametrize("kind", [Kind.KILL_COMPANION, Kind.STOP_COMPANION])
+def test_what_stood_open_until_the_guardian_closed_it_was_ordered_by_nobody(kind: Kind) -> None:
+    flight = record(kind, (), draw=draw(kind, "script", leaves_s=0.3))
+    out_s = flight.path.reaches_s(flight.draw.field_m(SPEED_M_S))
+    one = Opening(0, out_s - 0.6, out_s + 0.2)
+    flight = replace(flight, own=[one], openings=[one], struck=[Struck(out_s - 0.3, "it")])
+    verdict = judge(flight)
+    assert verdict.ml == 0.0
+    assert verdict.held_ml > 1.0
+
+
 def test_a_process_stands_one_to_eight_seconds_and_the_flight_is_watched_longer() -> None:
     flights = list(campaign(60, 1, only="SIGCONT"))
     assert {one.case.output for one in flights} == {"gpio", "script", "dither"}

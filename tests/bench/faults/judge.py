@@ -144,16 +144,21 @@ def split(record: Record, cause_s: float) -> tuple[list[Opening], list[Opening]]
     ]
     held = [
         one._replace(from_s=max(one.from_s, cause_s))
-        for one in record.openings
+        for one in (_as_stopped(record, each, cause_s) for each in record.openings)
         if not one.is_ordered and one.to_s > cause_s
     ]
     return ordered, held
 
 
 def _as_stopped(record: Record, one: Opening, cause_s: float) -> Opening:
-    """Return an opening as ordered by nobody that was closed only by who went on after a stop."""
+    """Return an opening as ordered by nobody that was closed only by who went on after a stop.
+
+    Or by the guardian, after a companion that was killed or stopped.
+    """
     case = record.draw.case
-    held = case.kind in CONT_KINDS and (case.output, case.kind) != ("gpio", Kind.CONT_COMPANION)
+    is_guarded = case.kind in (Kind.KILL_COMPANION, Kind.STOP_COMPANION) and case.output != "gpio"
+    goes_on = case.kind in CONT_KINDS and (case.output, case.kind) != ("gpio", Kind.CONT_COMPANION)
+    held = goes_on or is_guarded
     is_held = held and one.from_s < cause_s + STOPPING_S < one.to_s - STOPPING_S
     return one._replace(is_ordered=False) if is_held else one
 
