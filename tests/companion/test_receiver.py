@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from companion.cli.web_parts import watched as watched_by
 from companion.core.types import Fix, GnssReport, Input, SpeedReport, Telemetry
 from companion.receiver import M_PER_DEG, ReceiverOffset, ReceiverWatch
 
@@ -139,3 +142,19 @@ def test_an_unusual_delay_or_offset_is_said(
     assert found.is_unusual is is_unusual
     assert ("UNUSUAL" in found.words) is is_unusual
     assert ("the delay the autopilot assumes" in found.words) is (late_s is not None)
+
+
+def test_the_operators_page_is_told() -> None:
+    page, journal, link = (SimpleNamespace() for _ in range(3))
+    journal.record_input = lambda item: None
+    journal.fault, journal.lost, journal.free_bytes, journal.saved_age_s = None, 0, None, 0.0
+    journal.path = Path("flight-0001.gpkg")
+    link.on_event = lambda call: None
+    link.statistics = link.tank_l = None
+    link.component = SimpleNamespace(clock=SimpleNamespace(is_known=True, round_trip_s=None))
+    both = watched_by(page, journal, link)  # type: ignore[arg-type]
+    assert page.extras()["receiver"] is None
+    for item in to_and_fro(0.09, 0.6):
+        both.record_input(item)
+    told = page.extras()["receiver"]
+    assert told == {"late_s": pytest.approx(0.09, abs=0.003), "off_m": 0.6, "is_usual": False}
