@@ -101,6 +101,10 @@ def plan(
             max=CORRIDOR_MAX_M,
         ),
     ] = None,
+    holes: Annotated[
+        Literal["around", "over"],
+        typer.Option(help="Keep off the field's holes, as from obstacles, or not."),
+    ] = "around",
     no_spray: Annotated[
         list[Path] | None, typer.Option(metavar="FILE", help="Ground not to spray; repeatable.")
     ] = None,
@@ -247,6 +251,7 @@ def plan(
         depots=tuple(parse_mark(text, "--depot") for text in depot or ()),
         rate_l_ha=rate_l_ha,
         border_m=border_m,
+        over_holes=holes == "over",
         ends_over=ends_over,
         with_sprayer=sprayer,
         pause=BreakAsked(
@@ -475,6 +480,13 @@ def _lines(planned: Plan, result: dict[str, Any], files: list[Path]) -> list[str
         f"ferry {result['ferry_m'] / 1000:.2f} km{idle}",
         f"depot     {where}{' (suggested)' if planned.suggested_depot else ''}",
     ]
+    holes = planned.field.holes
+    if holes.kept_m and holes.count:
+        lines.append(
+            f"holes     {holes.count}, the aircraft stays {holes.kept_m:g} m away "
+            f"(mission.obstacle_buffer_m): {holes.bare_m2:.0f} m2 beside them stay bare; --holes "
+            "over if they may be flown over"
+        )
     if result["lines_file"] is not None:
         names = ", ".join(result["lines_files"])
         name = "it" if len(result["lines_files"]) == 1 else "each aircraft's own"

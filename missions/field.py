@@ -20,7 +20,7 @@ from missions.errors import PlanError
 from missions.fewer_corners import around_with_fewer_corners, inside_with_fewer_corners
 from missions.maps.local import Area, as_area, make_valid, polygons_of, project
 from missions.maps.local import places as places_of
-from missions.reading_outline import Obstacle
+from missions.reading_outline import Obstacle, around_ground
 from missions.strips import Floats
 
 # Coordinates are rounded when they are written, and a long edge is straight in degrees for one
@@ -57,6 +57,15 @@ class High:
     blocked: BaseGeometry
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Holes:
+    """The outline's holes: how far the aircraft's centre keeps off, and what that leaves bare."""
+
+    count: int
+    kept_m: float
+    bare_m2: float
+
+
 # What is not sprayed: obstacles by how they are drawn, with their buffers, and areas.
 Kind = Literal["point", "line", "area", "hole", "no spray"]
 DRAWN: tuple[Kind, ...] = ("point", "line", "area")
@@ -85,6 +94,7 @@ class Field:
     given_up_m2: float = 0.0
     high: High | None = None
     closed: tuple[tuple[Kind, BaseGeometry], ...] = ()
+    holes: Holes = Holes(count=0, kept_m=0.0, bare_m2=0.0)
 
     @property
     def kept_in(self) -> BaseGeometry:
@@ -109,6 +119,7 @@ def build_field(
     obstacles: Sequence[Area | Obstacle] = (),
     no_spray: Sequence[Area] = (),
     obstacle_buffer_m: float = 2.0,
+    over_holes: bool = False,
     no_spray_buffer_m: float = 0.0,
     wind: WindBuffer | None = None,
     swath_width_m: float,
@@ -140,7 +151,9 @@ def build_field(
     holes = [Polygon(ring) for part in polygons_of(outline) for ring in part.interiors]
     given = [each if isinstance(each, Obstacle) else Obstacle(geometry=each) for each in obstacles]
     grounds = [each.ground(frame, obstacle_buffer_m, offset_m) for each in given]
-    kept = shapely.union_all(grounds)
+    off_m = 0.0 if over_holes else obstacle_buffer_m
+    beside = shapely.union_all([around_ground(hole, off_m) for hole in holes if off_m])
+    kept = shapely.union_all([*grounds, beside])
     blocked = shapely.union_all([*holes, _simply_around(kept, BLOCKED_TOLERANCE_M)])
     flown = outline.difference(kept)
     around = _around(outline, kept)
@@ -155,8 +168,9 @@ def build_field(
         ]
         over = None
         if len(tall) < len(grounds):
-            beside = _around(outline, shapely.union_all(tall))
-            over = as_area(polygons_of(inside.difference(beside)))
+            tall.append(beside)
+            clear = _around(outline, shapely.union_all(tall))
+            over = as_area(polygons_of(inside.difference(clear)))
         if over is not None:
             above = _simply_around(shapely.union_all(tall), BLOCKED_TOLERANCE_M)
             high = High(fly=over, blocked=shapely.union_all([*holes, above]))
@@ -167,7 +181,8 @@ def build_field(
         apart = around_with_fewer_corners(_grown(closed, MARGIN_M), tolerance_m)
         spray = as_area(polygons_of(fly.difference(apart)))
     if spray is None or fly is None:
-        raise PlanError("obstacles and no-spray areas leave nothing of the field to spray")
+        what = "obstacles, holes" if off_m and holes else "obstacles"
+        raise PlanError(f"{what} and no-spray areas leave nothing of the field to spray")
     limit = flown.difference(closed)
     _check_width(spray, swath_width_m)
     given_up_m2 = float(limit.area) - float(spray.area)
@@ -182,14 +197,17 @@ def build_field(
         tolerance_m=tolerance_m,
         given_up_m2=given_up_m2,
         high=high,
-        closed=_closed_by_kind(given, grounds, holes, closed),
+        closed=_closed_by_kind(given, grounds, [*holes, beside], closed),
+        holes=Holes(
+            count=len(holes), kept_m=off_m, bare_m2=float(outline.intersection(beside).area)
+        ),
     )
 
 
 def _closed_by_kind(
     given: Sequence[Obstacle],
     grounds: Sequence[BaseGeometry],
-    holes: Sequence[Polygon],
+    holes: Sequence[BaseGeometry],
     no_spray: BaseGeometry,
 ) -> tuple[tuple[Kind, BaseGeometry], ...]:
     """Return what is not sprayed; what is of several kinds, as the last of them."""

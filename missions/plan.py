@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from typing import Literal
 
@@ -322,6 +322,7 @@ class Plan:
             "largest_skip_m2": self.coverage.largest_skip_m2,
             "simpler_border_m2": self.field.given_up_m2,
             "without_rate_ha": self.coverage.without_rate_m2 / 10_000.0,
+            "holes": asdict(self.field.holes),
             "area_ha": self.field.area_m2 / 10_000.0,
             "angle_deg": self.angle_deg,
             "swaths": len(self.lines),

@@ -99,6 +99,7 @@ class Asked:
     crs: str | None = None
     answers: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     border_m: float = 0.0
+    over_holes: bool = False
     ends_over: bool = False
     with_sprayer: bool = False
     ground: GroundAsked = NOTHING_ASKED
@@ -136,6 +137,7 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
         obstacles=_obstacles(asked, frame),
         no_spray=closed,
         obstacle_buffer_m=2.0 if mission is None else mission.obstacle_buffer_m,
+        over_holes=asked.over_holes,
         no_spray_buffer_m=keeps_m,
         wind=wind_of(asked.ground, config, has_areas=bool(closed)),
         swath_width_m=settings.swath_width_m,

@@ -276,9 +276,17 @@ class Obstacle:
         found: BaseGeometry = (
             local.buffer(AROUND * far_m, quad_segs=QUARTER)
             if dimensions == 0
-            else local.buffer(CLOSELY_AROUND * far_m, quad_segs=CLOSE_QUARTER, cap_style="square")
+            else around_ground(local, far_m)
         )
         return found
+
+
+def around_ground(local: BaseGeometry, far_m: float) -> BaseGeometry:
+    """Return ground, or lines, and all that is so near to them."""
+    found: BaseGeometry = local.buffer(
+        CLOSELY_AROUND * far_m, quad_segs=CLOSE_QUARTER, cap_style="square"
+    )
+    return found
 
 
 def read_obstacles(

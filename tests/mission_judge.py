@@ -80,8 +80,13 @@ class Drawn:
 
     def flown(self) -> BaseGeometry:
         """Return what may be flown over."""
-        taken = [self.plane.area(each).buffer(self.obstacle_buffer_m) for each in self.obstacles]
-        return self.plane.area(self.outline).difference(shapely.union_all(taken))
+        outline = self.plane.area(self.outline)
+        parts = shapely.get_parts(outline)
+        # A hole may be a pond: it is kept off as an obstacle is.
+        holes = [shapely.Polygon(ring) for part in parts for ring in part.interiors]
+        taken = [*holes, *(self.plane.area(each) for each in self.obstacles)]
+        taken = [each.buffer(self.obstacle_buffer_m) for each in taken]
+        return outline.difference(shapely.union_all(taken))
 
     def sprayed(self) -> BaseGeometry:
         """Return what may be sprayed."""

@@ -152,6 +152,7 @@ class Planning(Reading):
     speed_m_s: Annotated[float, Field(gt=0.0, le=30.0)] | None = None
     tank_l: Annotated[float, Field(gt=0.0, le=1000.0)] | None = None
     border_m: Annotated[float, Field(ge=0.0, le=50.0)] | None = None
+    holes: Literal["around", "over"] = "around"
     angle_deg: Annotated[float, Field(ge=0.0, lt=360.0)] | None = None
     depot: tuple[float, float] | None = None
     # A flight whose treated ground is left out: what it left is planned.
@@ -163,6 +164,7 @@ class Planning(Reading):
         names = ("rate_l_ha", "swath_m", "speed_m_s", "tank_l", "border_m", "angle_deg")
         given = self.model_dump(include=set(names), exclude_none=True)
         words = [f"--{key.replace('_', '-')}={value:g}" for key, value in given.items()]
+        words.append(f"--holes={self.holes}")
         return words if self.depot is None else [*words, f"--depot={self.depot[0]},{self.depot[1]}"]
 
 

@@ -239,7 +239,7 @@ async function load(list) {
 }
 
 function planned() {
-  const body = { field: byId("field").value, kind: byId("kind").value, no_spray: [...byId("no_spray").selectedOptions].map((one) => one.value), ...reading() };
+  const body = { field: byId("field").value, kind: byId("kind").value, holes: byId("holes").value, no_spray: [...byId("no_spray").selectedOptions].map((one) => one.value), ...reading() };
   if (byId("prescription").value) body.prescription = byId("prescription").value;
   if (byId("done").value) body.done = byId("done").value;
   for (const [id, kind] of Object.entries(KINDS)) if (byId(id).value !== "") body[id] = toSi(kind, Number(byId(id).value));
