@@ -268,10 +268,7 @@ class MissionTable(Table):
         Field(strict=False, max_length=100),
     ] = Field(default=(), description="[[latitude, longitude], ...]; empty: best place on the edge")
     obstacle_buffer_m: float = Field(
-        default=2.0,
-        ge=0,
-        le=100,
-        description="kept from obstacles and holes by the aircraft's centre: its radius and error",
+        default=2.0, ge=0, le=100, description="kept off obstacles, holes"
     )
     outline_tolerance_m: float = Field(
         default=0.1, ge=0, le=2, description="borders are drawn simpler by it, only ever inwards"
