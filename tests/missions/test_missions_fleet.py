@@ -68,7 +68,7 @@ def test_shares_cover_the_field_and_sorties_in_the_air_keep_apart(
     shares = [strips_of(plan, number) for number in range(1, aircraft + 1)]
     both = sum(shapely.intersection(a, b).area for a, b in combinations(shares, 2))
     whole = shapely.union_all(shares)
-    assert whole.area > 0.998 * ground.area
+    assert whole.area > 0.998 * plan.field.area_m2
     # Lines of a share end where the next begins; only what is sprayed twice anyway is in both.
     assert both <= plan.coverage.overlap_percent / 100.0 * ground.area + 1.0
     ways = {sortie.number: way_of(sortie) for sortie in plan.sorties}

@@ -52,6 +52,8 @@ def test_a_plan_is_drawn_with_all_of_its_sorties(
         "20",
         "--tank-l",
         "9",
+        "--holes",
+        "over",
         "--out",
         tmp_path / "m.geojson",
     ]
