@@ -148,11 +148,10 @@ def build_field(
             "in the CRS of its coordinates"
         )
     outline = translate(outline, *offset_m)
-    holes = [Polygon(ring) for part in polygons_of(outline) for ring in part.interiors]
+    off_m = 0.0 if over_holes else obstacle_buffer_m
+    holes, beside, kept_off = _holes_of(outline, off_m)
     given = [each if isinstance(each, Obstacle) else Obstacle(geometry=each) for each in obstacles]
     grounds = [each.ground(frame, obstacle_buffer_m, offset_m) for each in given]
-    off_m = 0.0 if over_holes else obstacle_buffer_m
-    beside = shapely.union_all([around_ground(hole, off_m) for hole in holes if off_m])
     kept = shapely.union_all([*grounds, beside])
     blocked = shapely.union_all([*holes, _simply_around(kept, BLOCKED_TOLERANCE_M)])
     flown = outline.difference(kept)
@@ -198,10 +197,16 @@ def build_field(
         given_up_m2=given_up_m2,
         high=high,
         closed=_closed_by_kind(given, grounds, [*holes, beside], closed),
-        holes=Holes(
-            count=len(holes), kept_m=off_m, bare_m2=float(outline.intersection(beside).area)
-        ),
+        holes=kept_off,
     )
+
+
+def _holes_of(outline: Area, off_m: float) -> tuple[list[Polygon], BaseGeometry, Holes]:
+    """Return the holes, the ground of them and so far beside them, and what that leaves bare."""
+    holes = [Polygon(ring) for part in polygons_of(outline) for ring in part.interiors]
+    beside = shapely.union_all([around_ground(hole, off_m) for hole in holes if off_m])
+    bare_m2 = float(outline.intersection(beside).area)
+    return holes, beside, Holes(count=len(holes), kept_m=off_m, bare_m2=bare_m2)
 
 
 def _closed_by_kind(

@@ -157,12 +157,11 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
         ground = untreated(
             ground, asked.pause.done, settings.swath_width_m, offset_m, opens=asked.opens
         )
-    configured = () if mission is None else mission.depots
     return Task(
         field=ground,
         settings=settings,
         rates=untreated_rates(rates, asked.pause.ground, whole, offset_m, opens=asked.opens),
-        depots=asked.depots or tuple(configured),
+        depots=asked.depots or (() if mission is None else tuple(mission.depots)),
         around=Surroundings(
             terrain=terrain_of(asked.ground, config, frame),
             run_in=run_in_of(asked.ground, config, ground, offset_m, opens=asked.opens),
