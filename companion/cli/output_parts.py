@@ -40,16 +40,25 @@ PARAMETERS_NAME, STOP_NAME = "parameters.json", "stop.json"
 
 
 def load_with_kept(path: Path, overrides: Sequence[str]) -> tuple[Config, tuple[str, ...]]:
-    """Return the configuration with the parameters that a station set, and all overrides.
+    """Return the configuration with what a station or the page set, and all overrides.
 
     What is given on the command line counts more than what was kept.
     """
     config = load(path, overrides=overrides)
+    field: tuple[str, ...] = ()
     state = _state_file(config)
     kept = _overrides(read_state(state))
-    if not kept:
+    said = f"parameters of {state}: {', '.join(kept)}"
+    if config.web.enabled and config.web.choose_field:
+        from companion.cli.field_choice import CHOSEN_NAME, read_choice
+
+        name, field = read_choice(state.with_name(CHOSEN_NAME))
+        if name:
+            note(f"the field is {name}, chosen on the operator's page, and not the configuration's")
+            state = state if kept else state.with_name(CHOSEN_NAME)
+    if not kept and not field:
         return config, tuple(overrides)
-    given = (*kept, *overrides)
+    given = (*kept, *field, *overrides)
     try:
         config = load(path, overrides=given)
     except ConfigError as error:
@@ -57,7 +66,8 @@ def load_with_kept(path: Path, overrides: Sequence[str]) -> tuple[Config, tuple[
             f"{state}: its values do not go with the configuration any more ({error}); delete it "
             "and set them again"
         ) from error
-    note(f"parameters of {state}: {', '.join(kept)}")
+    if kept:
+        note(said)
     return config, given
 
 

@@ -108,7 +108,7 @@ def run_companion(
             note(line)
         return flight_map, setup
 
-    async def flown() -> Journal:
+    async def flown() -> tuple[Journal, OperatorPage | None]:
         try:
             if servo_options(config) is None:
                 flight_map, setup = made()
@@ -118,19 +118,24 @@ def run_companion(
                 flight_map, setup = await meanwhile(made, link, executor)
             about = _about(config, given, flight_map)
             page = _page(config, given, setup, link, training=training)
-            return await _fly(config, setup, about, link, executor, page, screen, duration_s)
+            flight = _fly(config, setup, about, link, executor, page, screen, duration_s)
+            return await flight, page
         finally:
             await executor.stop()
             await link.close()
 
     with shown(), screen:
-        journal = runtime.execute(flown)
+        journal, page = runtime.execute(flown)
     kept, line = _kept(journal, link)
     answer(
         {"journal": kept, "lost_rows": journal.lost, "training": training},
         [line],
         as_json=as_json,
     )
+    if page is not None and page.is_restarting:
+        from companion.cli.field_choice import RESTART
+
+        raise typer.Exit(RESTART)
 
 
 async def _fly(

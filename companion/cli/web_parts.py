@@ -5,6 +5,7 @@ from __future__ import annotations
 import ipaddress
 import json
 import shlex
+import signal
 import socket
 import sys
 from collections.abc import Mapping, Sequence
@@ -16,6 +17,7 @@ from typing import Annotated, Any
 import typer
 
 from companion.cli.answer import AsJson, Overrides, answer, note
+from companion.cli.field_choice import CHOSEN_NAME, FieldChoice, no_choice, read_choice
 from companion.config import Config, load
 from companion.config.legal_entries import check
 from companion.config.limits import DROPLETS, OBSERVED_AT, WEATHER, declared_over
@@ -104,6 +106,10 @@ def build_page(
     tokens = kept_tokens(tokens_file(config))
     certificate, key = _tls_files(config)
     listener = listen(web.host, web.port)
+    state = config.resolve(config.link.state_folder).resolve()
+    flown, files = read_choice(state / CHOSEN_NAME) if web.choose_field else ("", ())
+    own = [item for item in given if item not in files]
+    refusal = no_choice(config, own)
     about = {
         "map": map_object(setup),
         "facts": _facts(config, setup, training),
@@ -118,10 +124,12 @@ def build_page(
         "way_file": str(config.resolve(config.journal.folder).resolve() / WAY_NAME),
         "doctor": _doctor(config, given),
         "host": {
-            "folder": str(config.resolve(config.link.state_folder).resolve()),
-            "config": _config_words(config, given),
+            "folder": str(state),
+            "config": _config_words(config, own),
             "upload_link": web.upload_link or "",
             "journals": str(config.resolve(config.journal.folder).resolve()),
+            "flown": flown,
+            "no_choice": refusal,
         },
         "version": version("vrspray"),
     }
@@ -131,10 +139,17 @@ def build_page(
         words = _config_words(config, given)
         note(f"its links: {shlex.join(('vrspray', 'token', 'show', *words))}")
     declarations = Declarations(config, link)
-    obey = obeying(link, declarations)
-    return OperatorPage(
-        listener, about, obey=obey, horizon_s=setup.longest_s, declared=lambda: declarations.shown
-    )
+
+    def end() -> None:
+        page.is_restarting = True
+        signal.raise_signal(signal.SIGTERM)
+
+    choice = FieldChoice(folder=state, refusal=refusal, newest=lambda: page.newest, end=end)
+    page = OperatorPage(
+        listener, about, obey=obeying(link, declarations, choice), horizon_s=setup.longest_s,
+        declared=lambda: declarations.shown,
+    )  # fmt: skip
+    return page
 
 
 def tokens_file(config: Config) -> Path:
@@ -207,14 +222,20 @@ def _facts(config: Config, setup: Setup, training: str) -> dict[str, Any]:
     }
 
 
-def obeying(link: VehicleLink, declarations: Declarations | None = None) -> Obey:
+def obeying(
+    link: VehicleLink,
+    declarations: Declarations | None = None,
+    choice: FieldChoice | None = None,
+) -> Obey:
     """Return what carries the page's orders out: as commands of the ground station are."""
+    others = {"declare": declarations, "field": choice}
 
     def obey(order: Order, now_s: float) -> Outcome:
-        if order.name == "declare":
-            if declarations is None:
-                return Outcome(accepted=False, text="nothing is declared here")
-            return declarations.obey(order, now_s)
+        if order.name in others:
+            other = others[order.name]
+            if other is None:
+                return Outcome(accepted=False, text=f"no {order.name} here")
+            return other.obey(order, now_s)
         answer = link.obey_page(order.name, order.value, now_s)
         accepted = answer.result == 0
         text = answer.text or (_DONE[order.name] if accepted else "refused")

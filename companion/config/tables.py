@@ -476,6 +476,11 @@ class WebTable(Table):
         default=None,
         description="second link to the autopilot, by which the page uploads missions",
     )
+    choose_field: bool = Field(
+        default=False,
+        description="true: a field planned on the page can be flown from there, in place of "
+        "prescription and mission.lines here",
+    )
     tls_certificate: Text | None = Field(default=None, description="PEM file; with tls_key: https")
     tls_key: Text | None = Field(default=None, description="PEM file of its private key")
 

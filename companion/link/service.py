@@ -341,13 +341,17 @@ class Service:
         self._version = version
         self._server = ParameterServer(command_state, encoder)
         self._decision: Decision | None = None
+        # Who commanded something since the last decision, and whether a stop was pressed then.
+        self._who, self._is_pressed = "", False
         self.on_event: OnEvent | None = None
         take_over(command_state)
 
     def look_at(self, decision: Decision | None, now_s: float) -> None:
         """Take what was decided: what may be changed, and what is left in the tank."""
         command_state, self._decision = self._command_state, decision
+        was_enabled = command_state.is_enabled
         command_state.look_at(decision, now_s)
+        self._tell_consent(decision, now_s, was_enabled=was_enabled)
         command_state.tank.flows(0.0 if decision is None else decision.flow_l_min, now_s)
         self._announcer.tank_l = command_state.tank.level_l
         self._announcer.set_values_rate(command_state.values_hz)
@@ -365,6 +369,7 @@ class Service:
         if not self._is_ours(command.target_system, target):
             return ()
         answer, sender = self._command_state.obey(command), command.sender
+        self._who = f"ground station {sender.system_id}/{sender.component_id}"
         self._send(
             self._encoder.ack(command.command, answer.result, sender.system_id, sender.component_id)
         )
@@ -391,6 +396,7 @@ class Service:
             source="web",
         )
         answer = self._command_state.obey(command)
+        self._who = "the operator's page"
         self._tell(answer, received_s)
         return answer
 
@@ -422,6 +428,18 @@ class Service:
             self.on_event(at_s, kind, text)
 
     # ------------------------------------------------------------------------------- inside
+
+    def _tell_consent(self, decision: Decision | None, now_s: float, *, was_enabled: bool) -> None:
+        """Have taken down who enabled, disabled and released a stop: it comes by several ways."""
+        enabled = self._command_state.is_enabled
+        state = None if decision is None else decision.state
+        was_pressed, self._is_pressed = self._is_pressed, state is not None and bool(state.estop)
+        who = self._who or ("the RC switch" if enabled else "switch, mode or disarming")
+        if was_pressed and not self._is_pressed:
+            self.tell_event(now_s, "consent", f"STOP released by {who}")
+        if enabled != was_enabled:
+            self.tell_event(now_s, "consent", f"{'en' if enabled else 'dis'}abled by {who}")
+        self._who = ""
 
     def _is_ours(self, system_id: int, component_id: int) -> bool:
         encoder = self._encoder

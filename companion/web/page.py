@@ -292,8 +292,10 @@ END_S, END_LOOK_S = 2.0, 0.02
 EVENTS_KEPT = 40
 BIND_TRIES_S = 3.0
 
-OrderName = Literal["stop", "enable", "disable", "refilled", "declare"]
-ORDERS: tuple[OrderName, ...] = ("stop", "enable", "disable", "refilled", "declare")
+OrderName = Literal["stop", "enable", "disable", "refilled", "declare", "field"]
+ORDERS: tuple[OrderName, ...] = ("stop", "enable", "disable", "refilled", "declare", "field")
+# Such an order counts in the moment in which it was given, or not at all.
+MOMENTARY = ("enable", "field")
 DECLARED_MAX, WORD_MAX = 8, 60
 
 
@@ -425,6 +427,9 @@ class OperatorPage:
         self._events: deque[tuple[float, str, str]] = deque(maxlen=EVENTS_KEPT)
         self._event_count = 0
         self._is_simulated = False
+        # The last decision, and whether the run ends for another field.
+        self.newest: Decision | None = None
+        self.is_restarting = False
         self._taken_s: deque[float] = deque(maxlen=ORDERS_PER_S)
         self._orders: socket.socket | None = None
         self._child: subprocess.Popen[bytes] | None = None
@@ -446,6 +451,7 @@ class OperatorPage:
 
     def show(self, decision: Decision) -> None:
         """Show a decision: at once where valves, state or reasons changed, else at 10 Hz."""
+        self.newest = decision
         key, now_s = shown_key(decision), decision.now_s
         is_news = key != self._key
         if not is_news and now_s - self._told_s < FRAME_S - _STEP_S:
@@ -498,10 +504,10 @@ class OperatorPage:
         full = len(self._taken_s) == ORDERS_PER_S and now_s - self._taken_s[0] < 1.0
         if full and order.name != "stop":
             outcome = Outcome(accepted=False, text="too many orders: wait a second")
-        elif order.name == "enable" and not 0.0 <= self._boot_clock() - order.boot_s <= (
+        elif order.name in MOMENTARY and not 0.0 <= self._boot_clock() - order.boot_s <= (
             ENABLE_AGE_MAX_S
         ):
-            outcome = Outcome(accepted=False, text="late enable not taken: enable again")
+            outcome = Outcome(accepted=False, text=f"late {order.name} not taken: try again")
         else:
             if order.name != "stop":
                 self._taken_s.append(now_s)

@@ -209,6 +209,8 @@ class Host:
     `folder`: where it may keep files. `config`: arguments that name the configuration of the
     flight. `upload_link`: a second link to the autopilot, or nothing. `journals`: their folder.
     `flying`: why nothing may be begun now. `work`: what is being worked on, by any part.
+    `flown`: the field that was chosen here, if any was. `no_choice`: why none can be; nothing where
+    `choose` has the run start anew with the proposal of this name in `folder`.
     """
 
     folder: str
@@ -217,6 +219,9 @@ class Host:
     journals: str
     flying: Callable[[], str | None]
     work: Work = field(default_factory=Work)
+    flown: str = ""
+    no_choice: str = "not on this page"
+    choose: Callable[[str], Coroutine[Any, Any, Any]] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -14,7 +14,7 @@ import secrets
 import socket
 import time
 from asyncio.subprocess import DEVNULL, PIPE
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from contextlib import suppress
 from html import escape
 from pathlib import Path
@@ -493,7 +493,11 @@ def _add_files(app: FastAPI, site: Site) -> None:
 def _add_part(app: FastAPI, site: Site, name: str, part: Part) -> None:
     """Add what another package registered: its files at NAME/, its interface at api/v1/NAME/."""
     router = APIRouter(prefix=f"{API}{name}", tags=[name], responses=REFUSED)
-    part.add(router, Host(flying=site.flying, **site.host))
+
+    def choose(field: str) -> Coroutine[Any, Any, Done]:
+        return site.orders.give("field", said={"field": field})
+
+    part.add(router, Host(flying=site.flying, choose=choose, **site.host))
     app.include_router(router)
     site.facts.setdefault("parts", []).append({"name": name, "title": part.title})
 

@@ -8,10 +8,11 @@ priority, and it ends when the vehicle is armed.
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import re
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +22,7 @@ from fastapi import APIRouter, HTTPException, Request, Response
 from fastapi.responses import FileResponse
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from companion.atomic_write import write_atomically
 from companion.web.parts import (
     Host,
     Limits,
@@ -55,6 +57,10 @@ UPLOAD = Limits(cpu_s=60, wait_s=120.0)
 MADE_MAP = "made-prescription.gpkg"
 # Plots and treatments, for `vrspray trial` after the harvest.
 MADE_TRIAL = "made-prescription.trial.geojson"
+# What was planned to be flown, each in a folder of its own where nothing is written again.
+FIELDS_KEPT = 10
+SETTINGS_NAME = "settings.json"
+PROPOSED_NAME = "field-proposed.json"
 
 Name = Annotated[str, Field(pattern=rf"^{NAME.pattern}$", max_length=80)]
 Places = Annotated[list[Name], Field(max_length=8)]
@@ -180,6 +186,12 @@ class Named(_Body):
     file: Name
 
 
+class Wanted(_Body):
+    """The planned field to fly; nothing: the configuration's own."""
+
+    field: Name | None = None
+
+
 @dataclass(slots=True)
 class Office:
     """The files of one field, and the child that works on them."""
@@ -187,6 +199,7 @@ class Office:
     host: Host
     given: Path = field(init=False)
     made: Path = field(init=False)
+    fields: Path = field(init=False)
     results: dict[str, Any] = field(default_factory=dict)
     # Files that are arriving, with the bytes that each may still have.
     arriving: dict[str, tuple[str, int]] = field(default_factory=dict)
@@ -195,6 +208,7 @@ class Office:
         """Name the folders; they are made when the first file comes."""
         self.given = Path(self.host.folder) / "office" / "given"
         self.made = self.given.with_name("made")
+        self.fields = self.given.with_name("fields")
         for part in self.given.parent.glob("*.part"):  # of a page that was ended
             part.unlink(missing_ok=True)
 
@@ -207,6 +221,9 @@ class Office:
             "task": self.host.work.task,
             "flights": self.flights(),
             "uploads": bool(self.host.upload_link),
+            "fields": [path.parent.name for path in sorted(self.fields.glob(f"*/{SETTINGS_NAME}"))],
+            "flown": self.host.flown,
+            "no_choice": self.host.no_choice,
             **self.results,
         }
 
@@ -354,24 +371,79 @@ class Office:
             return planned
 
     async def _compiled(self, asked: Planning, lines: str | None) -> dict[str, Any]:
-        """Compile the flight map of what was planned, by the configuration of the flight."""
+        """Compile the flight map of what was planned, by the configuration of the flight.
+
+        It and its sources have a folder of their own: no later plan writes over what is flown.
+        """
+        folder = self._folder_of(asked, lines)
+        here = f"fields/{folder.name}"
         sets: dict[str, str] = {
-            "prescription.file": self._beside(f"given/{asked.prescription}"),
-            "prescription.boundary": self._beside(f"given/{asked.field}"),
-            **({"mission.lines": self._beside(lines)} if lines else {}),
+            "prescription.file": self._beside(f"{here}/{asked.prescription}"),
+            "prescription.boundary": self._beside(f"{here}/{asked.field}"),
+            **({"mission.lines": self._beside(f"{here}/{Path(lines).name}")} if lines else {}),
         }
         sets |= {f"prescription.{key}": value for key, value in _answers(asked).items()}
-        words = [word for key, value in sets.items() for word in ("--set", f"{key}={value}")]
-        file, out = f"given/{asked.prescription}", "made/field.flightmap.gpkg"
-        command = ["map", "compile", file, "--out", out, *self.host.config, *words, "--json"]
+        if asked.no_spray:
+            kept_off = [self._beside(f"{here}/{name}") for name in asked.no_spray]
+            sets["prescription.exclusions"] = json.dumps(kept_off, ensure_ascii=False)
+        file, out = f"{here}/{asked.prescription}", f"{here}/field.flightmap.gpkg"
+        command = ["map", "compile", file, "--out", out, *self.host.config, *_set(sets), "--json"]
         done = await self.run("plan", command)
         flown = {**sets, "prescription.file": self._beside(out)}
+        if done.error is None:
+            _link(self.given.parent / out, self.made / "field.flightmap.gpkg")
+            (folder / SETTINGS_NAME).write_text(json.dumps(flown), encoding="utf-8")
         return {
             "error": done.error,
             "problems": done.found.get("problems", []),
+            "field": folder.name,
             # What the configuration has to say, for `run` to fly what was planned here.
             "settings": flown,
         }
+
+    def _folder_of(self, asked: Planning, lines: str | None) -> Path:
+        """Return a new folder with the files of a plan; the oldest that nobody flies are removed.
+
+        Files are links: what comes later under the name of one is another file.
+        """
+        self.fields.mkdir(parents=True, exist_ok=True, mode=0o700)
+        names = sorted(path.name for path in self.fields.iterdir())
+        used = " ".join(
+            [*self.host.config, Path(self.host.config[1]).read_text("utf-8", "replace")]
+        )
+        for name in names[: max(len(names) + 1 - FIELDS_KEPT, 0)]:
+            if name != self.host.flown and f"fields/{name}/" not in used:
+                shutil.rmtree(self.fields / name, ignore_errors=True)
+        number = 1 + max((int(name[:4]) for name in names if name[:4].isdecimal()), default=0)
+        folder = self.fields / f"{number:04d}-{Path(asked.field).stem}"[:60]
+        folder.mkdir(mode=0o700)
+        for path in [*self.given.iterdir(), *([self.given.parent / lines] if lines else [])]:
+            _link(path, folder / path.name)
+        return folder
+
+    async def fly(self, wanted: Wanted) -> dict[str, Any]:
+        """Have the run start anew with a field that was planned here, or with its own."""
+        self.refuse_now()
+        host, sets = self.host, dict[str, str]()
+        if host.no_choice or host.choose is None:
+            raise HTTPException(409, host.no_choice)
+        if wanted.field is not None:
+            file = self.fields / wanted.field / SETTINGS_NAME
+            if not _is_name(wanted.field) or not file.is_file():
+                raise HTTPException(404, f"{wanted.field}: not planned here; plan first")
+            sets = json.loads(file.read_bytes())
+        with or_refused(), host.work.on("another field"):
+            # What a start would refuse is refused here, where somebody can choose again.
+            command = ["config", "check", *host.config, *_set(sets), "--json"]
+            done = await run_child(command, self.given.parent, TIMES["check"], flying=host.flying)
+            if done.error is not None:
+                raise HTTPException(409, done.error)
+            proposal = json.dumps({"field": wanted.field, "settings": sets})
+            write_atomically(Path(host.folder) / PROPOSED_NAME, proposal.encode(), mode=0o600)
+            told = await host.choose(wanted.field or "")
+        if not told.accepted:
+            raise HTTPException(409, told.text)
+        return self.state()
 
     def _beside(self, name: str) -> str:
         """Return a file as the configuration names it: from its own folder, where it lies below."""
@@ -418,6 +490,19 @@ async def _written(part: Path, name: str, request: Request, room: int) -> None:
             if size > room:
                 raise HTTPException(413, f"{name}: larger than {room / 1e6:.0f} MB")
             await asyncio.to_thread(file.write, data)
+
+
+def _set(settings: Mapping[str, str]) -> list[str]:
+    return [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
+
+
+def _link(path: Path, link: Path) -> None:
+    """Give a file one more name; a copy where the disk cannot."""
+    link.unlink(missing_ok=True)
+    try:
+        os.link(path, link)
+    except OSError:
+        shutil.copyfile(path, link)
 
 
 def _answers(asked: Planning) -> dict[str, str]:
@@ -478,25 +563,12 @@ def add(router: APIRouter, host: Host) -> None:
         office.results.clear()
         return office.state()
 
-    @router.post("/make", responses=busy)
-    async def make(asked: Making) -> dict[str, Any]:
-        """Make zones, spots or a trial in a child, as a map among the files."""
-        return await office.make(asked)
-
-    @router.post("/check", responses=busy)
-    async def check(asked: Check) -> dict[str, Any]:
-        """Read a prescription map in a child, and return what is in it and wrong with it."""
-        return await office.check(asked)
-
-    @router.post("/plan", responses=busy)
-    async def plan(asked: Planning) -> dict[str, Any]:
-        """Plan in a child, and return sorties, litres and files."""
-        return await office.plan(asked)
-
-    @router.post("/upload", responses=busy)
-    async def upload(asked: Sent) -> dict[str, Any]:
-        """Put a planned sortie on the vehicle, and verify it by reading it back."""
-        return await office.send(asked)
+    works: dict[str, Callable[..., Any]] = {
+        "make": office.make, "check": office.check, "plan": office.plan, "upload": office.send,
+        "fly": office.fly,
+    }  # fmt: skip
+    for name, work in works.items():
+        router.add_api_route(f"/{name}", work, methods=["POST"], responses=busy)
 
     @router.get("/{place}/{name}", responses=busy, response_class=Response)
     async def file(place: Literal["given", "made"], name: str) -> Response:

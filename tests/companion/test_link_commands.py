@@ -391,3 +391,27 @@ def test_events_are_told_for_the_record(peer: Peer, component: Component) -> Non
         (3.0, "command", "rate override 90 %"),
         (4.0, "command", "refilled, tank 12.5 L"),
     ]
+
+
+def test_the_record_says_who_enabled_disabled_and_released(peer: Peer) -> None:
+    told: list[str] = []
+    component = Component(ComponentOptions(page_may_enable=True), peer.take)
+    component.on_event = lambda _at_s, kind, text: told.append(text) if kind == "consent" else None
+    component.receive(peer.heartbeat(), 0.0)
+    stopped = replace(ENABLED, enabled=False, estop=True)
+    component.receive(peer.command(216, 1.0), 1.0)
+    for state in (ENABLED, ENABLED):  # said once
+        component.tick(replace(CLOSED, state=state), 1.1)
+    component.obey_page("stop", None, 1.2)
+    component.tick(replace(CLOSED, state=stopped), 1.3)
+    component.obey_page("disable", None, 1.4)
+    component.tick(replace(CLOSED, state=replace(stopped, estop=False)), 1.5)
+    component.tick(replace(CLOSED, state=ENABLED), 1.6)
+    component.tick(replace(CLOSED, state=replace(ENABLED, enabled=False)), 1.7)
+    assert told == [
+        "enabled by ground station 255/190",
+        "disabled by the operator's page",
+        "STOP released by the operator's page",
+        "enabled by the RC switch",
+        "disabled by switch, mode or disarming",
+    ]

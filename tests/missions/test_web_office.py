@@ -31,6 +31,13 @@ SQUARE = {
     "type": "Polygon",
     "coordinates": [[[8.0, 47.0], [8.001, 47.0], [8.001, 47.0004], [8.0, 47.0004], [8.0, 47.0]]],
 }
+# In the middle of the field of Anyang.
+GARDEN = {
+    "type": "Polygon",
+    "coordinates": [
+        [[114.5437, 35.9965], [114.5438, 35.9965], [114.5438, 35.9966], [114.5437, 35.9965]]
+    ],
+}
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
@@ -256,6 +263,85 @@ async def test_only_an_operator_loads_and_only_from_the_page_itself(tmp_path: Pa
         assert not (tmp_path / "office").exists()
 
 
+@pytest.mark.timeout(600)
+async def test_a_later_plan_writes_over_no_field_and_one_is_flown_by_the_operator_only(
+    tmp_path: Path,
+) -> None:
+    host = {
+        "folder": str(tmp_path), "config": CONFIG, "upload_link": "", "journals": "",
+        "no_choice": "",
+    }  # fmt: skip
+    async with served(is_local=False, host=host) as site:
+        mine, look = ({"Authorization": f"Bearer {token}"} for token in (OPERATE, VIEW))
+
+        async def asked(what: str, headers: dict[str, str] = mine, **body: Any) -> Reply:
+            return await site.asked("POST", f"{OFFICE}/{what}", body, headers)
+
+        site.show(armed=False, in_air=False)
+        files = [*ANYANG.glob("prescription.*"), ANYANG / "boundary.geojson"]
+        for path in files:
+            assert (await load(site, path.name, path.read_bytes(), **mine)).status == 200
+        await load(site, "garden.geojson", json.dumps(GARDEN).encode(), **mine)
+        wanted = {
+            "field": "boundary.geojson",
+            "prescription": "prescription.shp",
+            "rate_field": "rate",
+        }
+        plans = [(await asked("plan", **wanted, no_spray=["garden.geojson"])).json["plan"]]
+        kept = tmp_path / "office" / "fields"
+        before = {path: path.read_bytes() for path in kept.rglob("*") if path.is_file()}
+        # Another boundary under the same name, and another plan.
+        await load(site, "boundary.geojson", json.dumps(SQUARE).encode(), **mine)
+        await load(site, "boundary.geojson", (ANYANG / "boundary.geojson").read_bytes(), **mine)
+        plans.append((await asked("plan", **wanted, speed_m_s=4)).json["plan"])
+        first, second = (plan["flight_map"] for plan in plans)
+        assert first["error"] is None
+        assert second["error"] is None
+        assert [first["field"], second["field"]] == ["0001-boundary", "0002-boundary"]
+        assert all(path.read_bytes() == data for path, data in before.items())
+        named = [
+            *first["settings"].values(),
+            *json.loads(first["settings"]["prescription.exclusions"]),
+        ]
+        assert [Path(one) in before for one in named if one.startswith("/")] == [True] * 4
+        assert not {*first["settings"].values()} & {*second["settings"].values()} - {"rate"}
+        # Looking is not enough, and a field is one that was planned here.
+        assert (await asked("fly", look, field="0001-boundary")).status == 403
+        for field in ("0009-other", "..", "0001-boundary/.."):
+            assert (await asked("fly", field=field)).status in (404, 422)
+        site.show(armed=True, in_air=False)
+        await until(lambda: site.ask("GET", OFFICE, headers=look).json["not_now"] is not None)
+        assert (await asked("fly", field="0001-boundary")).status == 409
+        assert not site.orders
+        site.show(armed=False, in_air=False)
+        await until(lambda: site.ask("GET", OFFICE, headers=look).json["not_now"] is None)
+        assert (await asked("fly", field="0001-boundary")).status == 200
+        assert [(one.name, dict(one.said)) for one in site.orders] == [
+            ("field", {"field": "0001-boundary"})
+        ]
+        proposed = json.loads((tmp_path / "field-proposed.json").read_text())
+        assert proposed == {"field": "0001-boundary", "settings": first["settings"]}
+        # What a start would refuse is refused while somebody can still choose.
+        (kept / "0001-boundary" / "field.flightmap.gpkg").write_bytes(b"no map")
+        refused = await asked("fly", field="0001-boundary")
+        assert refused.status == 409
+        assert "prescription.file" in refused.json["detail"]
+        assert len(site.orders) == 1
+
+
+async def test_without_leave_of_the_configuration_no_field_is_flown(tmp_path: Path) -> None:
+    host = {
+        "folder": str(tmp_path), "config": CONFIG, "upload_link": "", "journals": "",
+        "no_choice": "set web.choose_field = true",
+    }  # fmt: skip
+    async with served(host=host) as site:
+        site.show(armed=False, in_air=False)
+        await until(lambda: site.ask("GET", OFFICE).json["not_now"] is None)
+        reply = await site.asked("POST", f"{OFFICE}/fly", {"field": None})
+        assert (reply.status, reply.json["detail"]) == (409, "set web.choose_field = true")
+        assert not site.orders
+
+
 @IN_LOOP
 async def test_nothing_begins_while_the_vehicle_is_armed(site: Site) -> None:
     await load(site, "a.geojson", json.dumps(SQUARE).encode())
@@ -409,4 +495,4 @@ def test_the_page_finds_the_office_by_its_entry_point() -> None:
     router = APIRouter()
     host = Host(folder=os.devnull, config=[], upload_link="", journals="", flying=lambda: None)
     parts["office"].add(router, host)
-    assert len(router.routes) == 8
+    assert len(router.routes) == 9

@@ -88,8 +88,6 @@ export class Orders {
     this.enableButton.disabled = !mayOperate || (!latched && (enabled || !facts.may_enable));
     this.disableButton.disabled = !mayOperate || !enabled;
     for (const item of this.refill.elements) item.disabled = !mayOperate;
-    const stopLabel = state.state === "estop" ? "STOPPED" : "STOP";
-    if (this.stopButton.textContent !== stopLabel) this.stopButton.textContent = stopLabel;
     const ways = { command: "the ground station", rc: "the RC switch", web: "this page" };
     document.getElementById("orders-note").textContent = !mayOperate
       ? "You may look and stop. Enabling needs the operator's link."

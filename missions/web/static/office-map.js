@@ -1,8 +1,8 @@
 // The office's map by WebGL: zones, boundary, planned lines, and the corners that are being drawn.
 
 const LOOK = {
-  day: { ground: "#e2e6df", field: "#10150f", pass: "#0a4f8f", ferry: "#b45309", draw: "#c4060c", low: "#b5dfae", high: "#232f80" },
-  night: { ground: "#0b1114", field: "#e9efe9", pass: "#7dd3fc", ferry: "#ffb04d", draw: "#ff7b7b", low: "#3f5fa3", high: "#fde725" },
+  day: { ground: "#e2e6df", field: "#10150f", passes: ["#0a4f8f", "#a3125f", "#5b3a00", "#6b21a8"], ferry: "#b45309", draw: "#c4060c", low: "#b5dfae", high: "#232f80" },
+  night: { ground: "#0b1114", field: "#e9efe9", passes: ["#7dd3fc", "#ff9ad5", "#c5f277", "#c4a2ff"], ferry: "#ffb04d", draw: "#ff7b7b", low: "#3f5fa3", high: "#fde725" },
 };
 const NOTHING = { type: "FeatureCollection", features: [] };
 
@@ -30,7 +30,7 @@ export class OfficeMap {
     for (const name of ["zones", "field", "lines", "draw"]) map.addSource(name, { type: "geojson", data: NOTHING });
     map.addLayer({ id: "zones", type: "fill", source: "zones", paint: { "fill-color": look.low, "fill-opacity": 0.75 } });
     map.addLayer({ id: "field", type: "line", source: "field", paint: { "line-color": look.field, "line-width": 2.5 } });
-    map.addLayer({ id: "lines", type: "line", source: "lines", paint: { "line-color": ["match", ["get", "kind"], "spray", look.pass, look.ferry], "line-width": ["match", ["get", "kind"], "spray", 2.5, 1.5] } });
+    map.addLayer({ id: "lines", type: "line", source: "lines", paint: { "line-color": ["match", ["get", "kind"], ["spray", "spray-part"], ["match", ["%", ["get", "sortie"], 4], ...look.passes.slice(0, 3).flatMap((color, k) => [k + 1, color]), look.passes[3]], look.ferry], "line-width": ["match", ["get", "kind"], ["spray", "spray-part"], 2.5, 1.5] } });
     map.addLayer({ id: "draw", type: "line", source: "draw", paint: { "line-color": look.draw, "line-width": 3, "line-dasharray": [2, 1] } });
     map.addLayer({ id: "corners", type: "circle", source: "draw", filter: ["==", ["geometry-type"], "Point"], paint: { "circle-radius": 9, "circle-color": look.draw, "circle-stroke-color": look.ground, "circle-stroke-width": 2 } });
     // For tests: `data-settled` is there once the map shows what it was given last.
@@ -52,6 +52,8 @@ export class OfficeMap {
       onClick(place(event));
     });
   }
+
+  colorOf(sortie) { return this.look.passes[(sortie + 3) % 4]; }
 
   // Each is an address of the office; read in the map's worker, and only when it is another.
   showFiles({ zones, field, lines, rates }) {

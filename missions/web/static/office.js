@@ -121,7 +121,9 @@ function showCheck() {
 }
 
 function sortieTable(found) {
-  return tableOf(["Sortie", "Volume", "Fill to", "Minutes", "Passes"], found.sorties.map((one) => [one.number, withUnit("volume", one.volume_l), withUnit("volume", one.fill_l), (one.airborne_s / 60).toFixed(1), one.swaths]));
+  const table = tableOf(["Sortie", "Volume", "Fill to", "Minutes", "Passes"], found.sorties.map((one) => [one.number, withUnit("volume", one.volume_l), withUnit("volume", one.fill_l), (one.airborne_s / 60).toFixed(1), one.swaths]));
+  found.sorties.forEach((one, k) => { table.rows[k + 1].cells[0].style.borderLeft = `6px solid ${map.colorOf(one.number)}`; });
+  return table;
 }
 
 // What to pour before each sortie, from top to bottom; products in their own unit.
@@ -151,7 +153,7 @@ function showPlan() {
     sortieTable(found), ...mixParts(found.mix), ...found.warnings.map((text) => make("p", text, "refused")),
   ];
   if (plan.flight_map?.error) parts.push(refused(`flight map: ${plan.flight_map.error}`));
-  else if (plan.flight_map) parts.push(make("p", "To fly it, set this in the configuration, and start run again:", "small"), make("pre", Object.entries(plan.flight_map.settings).map(([key, value]) => `${key} = ${JSON.stringify(value)}`).join("\n")));
+  else if (plan.flight_map && state.no_choice) parts.push(make("p", "To fly it, set this in the configuration, and start run again:", "small"), make("pre", Object.entries(plan.flight_map.settings).map(([key, value]) => `${key} = ${value.startsWith("[") ? value : JSON.stringify(value)}`).join("\n")));
   const links = make("p");
   for (const file of state.made) {
     const link = make("a", file.name);
@@ -171,11 +173,32 @@ function showPlan() {
   box.replaceChildren(...parts);
 }
 
+// Another field: the companion ends on the ground, and comes back with it.
+function showFly() {
+  const names = ["", ...(state.fields ?? [])], last = state.plan?.flight_map?.field;
+  choices(byId("fly-field"), names.map((name) => [name, name || "the configuration's own"]), last && chosenBy.fly === undefined ? last : undefined);
+  byId("fly-note").textContent = `Flown now: ${state.flown || "the configuration's own field"}. ${state.no_choice ? `${state.no_choice[0].toUpperCase()}${state.no_choice.slice(1)}.` : "Upload its mission, too."}`;
+  byId("fly-button").disabled = Boolean(state.no_choice);
+}
+
+async function fly() {
+  const field = byId("fly-field").value;
+  let isTaken = false;
+  await doing("Changing the field", async () => { const next = await ask("office/fly", { field: field || null }); isTaken = true; return next; });
+  for (let k = 0; isTaken && k < 60; k += 1) {
+    say("The companion starts again …");
+    await new Promise((resolve) => setTimeout(resolve, 1000));
+    const next = await ask("office").catch(() => null);
+    if (next && !next.task && (next.flown === field)) { state = next; show(); say("The field was changed."); return; }
+  }
+  if (isTaken) say("The companion did not come back: look at its log.", true);
+}
+
 function show() {
   const box = byId("not-now");
   box.hidden = !state.not_now;
   box.textContent = state.not_now ? `Not now: ${state.not_now}.` : "";
-  showFiles(); showMade(); showCheck(); showPlan();
+  showFiles(); showMade(); showCheck(); showPlan(); showFly();
   byId("draw-save").disabled = corners.length < 3 || !role;
   byId("draw-edit").disabled = !byId("field").value.endsWith(".geojson");
   const lines = state.made.find((file) => file.name.endsWith(".lines.geojson"));
@@ -297,6 +320,8 @@ for (const name of Object.keys(ROLES)) byId(`draw-${name}`).addEventListener("cl
 byId("draw-undo").addEventListener("click", () => draw(corners.slice(0, -1)));
 byId("draw-save").addEventListener("click", save);
 byId("draw-edit").addEventListener("click", edit);
+byId("fly-form").addEventListener("submit", (event) => { event.preventDefault(); fly(); });
+byId("fly-field").addEventListener("change", () => { chosenBy.fly = byId("fly-field").value; });
 byId("corners").addEventListener("input", (event) => draw(cornersOf(event.target.value), true));
 for (const id of ["prescription", "field", "data"]) byId(id).addEventListener("change", () => { chosenBy[id] = byId(id).value; show(); });
 

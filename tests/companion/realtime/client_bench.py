@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import re
 import shutil
 import sys
@@ -22,6 +23,7 @@ from typing import Any
 import pytest
 import shapely
 
+from companion.cli.field_choice import RESTART, RESTARTS
 from companion.config import load
 from missions.maps.compiling import compiled_setup
 from sitl.serve import judge
@@ -134,15 +136,54 @@ async def vehicle_bench(autopilot: str, config: Path) -> AsyncIterator[Bench]:
         yield bench
 
 
-@asynccontextmanager
-async def companion_of(bench: Bench, *overrides: str) -> AsyncIterator[None]:
-    """Run `vrspray run` on the bench's link; it ends in order."""
-    process = await asyncio.create_subprocess_exec(
+def _started(bench: Bench, *overrides: str, **environment: str) -> Any:
+    return asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "companion", "run", "--config", str(bench.config)),
         *(word for one in (f"link.url={bench.url}", *overrides) for word in ("--set", one)),
+        env={**os.environ, **environment},
         stdout=asyncio.subprocess.DEVNULL,
         stderr=asyncio.subprocess.PIPE,
     )
+
+
+@asynccontextmanager
+async def service_of(bench: Bench, *overrides: str) -> AsyncIterator[list[int]]:
+    """Run `vrspray run` as the service does: one that ends with 75 is started anew.
+
+    Yields how each that has ended did so.
+    """
+    ended: list[int] = []
+    running: list[asyncio.subprocess.Process] = []
+
+    async def serve() -> None:
+        while not ended or ended[-1] == RESTART:
+            process = await _started(bench, *overrides, **{RESTARTS: str(RESTART)})
+            running.append(process)
+            await bench.read(process)
+            ended.append(await process.wait())
+
+    serving = asyncio.create_task(serve())
+    try:
+        yield ended
+        assert not serving.done(), bench.said
+        running[-1].terminate()
+        async with asyncio.timeout(10.0):
+            await serving
+        assert ended[-1] == 0, bench.said
+    finally:
+        serving.cancel()
+        for process in running:
+            if process.returncode is None:
+                process.kill()
+                await process.wait()
+        await asyncio.gather(serving, return_exceptions=True)
+    assert "Traceback" not in bench.said, bench.said
+
+
+@asynccontextmanager
+async def companion_of(bench: Bench, *overrides: str) -> AsyncIterator[None]:
+    """Run `vrspray run` on the bench's link; it ends in order."""
+    process = await _started(bench, *overrides)
     reading = asyncio.create_task(bench.read(process))
     try:
         yield

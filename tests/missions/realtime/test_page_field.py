@@ -26,7 +26,7 @@ from tests.companion.realtime.client_bench import (
     CLOSED_US,
     EXAMPLE,
     Bench,
-    companion_of,
+    service_of,
     vehicle_bench,
 )
 from tests.companion.realtime.test_operators_page import (
@@ -223,6 +223,17 @@ class Day:
         await expect(page.locator("#check")).to_contain_text("made-prescription.gpkg: ")
         await page.locator("#speed_m_s").fill("5")
 
+    async def fly_what_was_planned(self) -> None:
+        """Choose the planned field: the companion comes back with it, and enables nothing."""
+        page = self.page
+        note = page.locator("#fly-note")
+        await expect(note).to_contain_text("the configuration's own field")
+        await expect(page.locator("#fly-field")).to_have_value("0001-drawn-boundary")
+        await page.get_by_role("button", name="Fly this field").click()
+        await expect(note).to_contain_text("Flown now: 0001-drawn-boundary", timeout=60_000)
+        assert "the field is 0001-drawn-boundary, chosen on the operator's page" in self.bench.said
+        assert not is_open(self.bench)
+
     async def declare(self) -> None:
         """Type what label and permit want to know: before that the sprayer is not ready."""
         page = self.page
@@ -290,7 +301,7 @@ class Day:
         await release(self.page)
 
 
-@pytest.mark.timeout(400)
+@pytest.mark.timeout(600)
 async def test_a_field_is_drawn_zoned_planned_flown_stopped_continued_and_reported(
     tmp_path: Path,
 ) -> None:
@@ -308,24 +319,24 @@ async def test_a_field_is_drawn_zoned_planned_flown_stopped_continued_and_report
         page = await browser.new_page(viewport={"width": 390, "height": 844}, has_touch=True)
         day = Day(bench, page, f"http://127.0.0.1:{port}/")
         day.watch()
-        async with companion_of(bench, *web):
+        # The weather that was observed ages by the autopilot's clock: it must be the browser's.
+        bench.stub.utc_offset_s = time.time() - time.monotonic()
+        limits = tmp_path / "limits.toml"
+        limits.write_text(LIMITS)
+        async with service_of(
+            bench, *web, "web.choose_field=true", f'limits.file="{limits}"'
+        ) as ended:
             await bench.until(lambda: "operator's page:" in bench.said, within_s=60.0)
             await day.draw_and_make(samples, corners(two_zones()))
             await plan_and_upload(page)
-            settings = await settings_told(page)
             # What is to be poured is in the mix: one part in a hundred of what it says.
             rows = await page.locator("#plan .wide tr").all_inner_texts()
             wetter, mixed = (float(row.split()[-1]) for row in rows[-2:])
             assert wetter == pytest.approx(0.01 * mixed * 1000.0, rel=0.05)
             assert mixed > PRESCRIBED_L
-        assert len(bench.stub.flight.items) >= 6
-        bench.said = ""
-        # The weather that was observed ages by the autopilot's clock: it must be the browser's.
-        bench.stub.utc_offset_s = time.time() - time.monotonic()
-        limits = tmp_path / "limits.toml"
-        limits.write_text(LIMITS)
-        async with companion_of(bench, *web, *settings, f'limits.file="{limits}"'):
-            await bench.until(lambda: "operator's page:" in bench.said, within_s=60.0)
+            assert len(bench.stub.flight.items) >= 6
+            await day.fly_what_was_planned()
+            assert ended == [75]
             await day.open()
             await day.declare()
             await day.take_off()
