@@ -6,6 +6,7 @@ The reference has the true state, takes its acceleration for constant, and is to
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from sitl.profile import load_profile
 from sitl.trajectory import Trajectory
 from tests.border_flight import flows
 from tests.builders import boom, setup
-from tests.moving_flight import Strip, by_reference, executed
+from tests.moving_flight import STEP_S, Strip, by_reference, executed
 
 MOST_M_S2 = 5.0
 MORE_M = 0.05
@@ -45,8 +46,13 @@ def made_of(flight: Flight) -> Setup:
     )  # fmt: skip
 
 
-def worse_than_reference_m(flight: Flight, late_s: float, *, noisy: bool = False) -> float:
-    """Return by how much more any valve sprayed outside than the reference's."""
+def worse_than_reference_m(
+    flight: Flight, *, noisy: bool = False, believed_s: float = STEP_S, decisions: int = 0
+) -> float:
+    """Return by how much more any valve sprayed outside than the reference's.
+
+    Or than one's whose acceleration is a mean over `believed_s`, or who closes `decisions` later.
+    """
     options = FlightOptions(fidelity="averaged", noise=noisy)
     told_late_s = options.estimator_lag_s if noisy else 0.0
     lag = replace(flight.lag, position_s=told_late_s)
@@ -62,12 +68,12 @@ def worse_than_reference_m(flight: Flight, late_s: float, *, noisy: bool = False
         own_m = strip.beyond_m(flight.field, flight.flown, here)
         if own_m <= worst_m:
             continue
-        ordered = by_reference(flight.field, strip, flight.flown, steps_s)
-        # Who is late closes late, and opens no sooner.
-        late = sorted([(at_s + (0.0 if value else late_s), value) for at_s, value in ordered])
-        theirs_m = max(
-            strip.beyond_m(flight.field, flight.flown, flows(one, first_s=first_s, last_s=last_s))
-            for one in (ordered, late)
-        )
+        theirs_m = 0.0
+        for over_s, late in product({STEP_S, believed_s}, {0, decisions}):
+            theirs = by_reference(
+                flight.field, strip, flight.flown, steps_s, believed_s=over_s, decisions=late
+            )
+            spans = flows(theirs, first_s=first_s, last_s=last_s)
+            theirs_m = max(theirs_m, strip.beyond_m(flight.field, flight.flown, spans))
         worst_m = max(worst_m, own_m - theirs_m)
     return worst_m

@@ -196,19 +196,26 @@ class Strip(NamedTuple):
 
 
 def by_reference(
-    field: shapely.Geometry, strip: Strip, flown: Trajectory, at_s: Floats
+    field: shapely.Geometry,
+    strip: Strip,
+    flown: Trajectory,
+    at_s: Floats,
+    *,
+    believed_s: float = STEP_S,
+    decisions: int = 0,
 ) -> list[tuple[float, float]]:
     """Return the orders of who knows the true state, and takes its acceleration for constant.
 
     At the same times as ours. It closes when the strip would be outside when the flow ends, and
-    opens when it would be inside when the flow begins, and then.
+    opens when it would be inside when the flow begins, and then. Its acceleration is the mean over
+    `believed_s`; it closes once that has been so for some `decisions` more.
     """
     at = flown.at(at_s)
     # The acceleration and the turn that have been, up to now: nobody knows those to come.
-    before = flown.at(at_s - STEP_S)
-    gain_e = (at.velocity_east_m_s - before.velocity_east_m_s) / STEP_S
-    gain_n = (at.velocity_north_m_s - before.velocity_north_m_s) / STEP_S
-    turn = (at.heading_deg - before.heading_deg) / STEP_S
+    before = flown.at(at_s - believed_s)
+    gain_e = (at.velocity_east_m_s - before.velocity_east_m_s) / believed_s
+    gain_n = (at.velocity_north_m_s - before.velocity_north_m_s) / believed_s
+    turn = (at.heading_deg - before.heading_deg) / believed_s
     shapely.prepare(field)
 
     def inside(by_s: float) -> NDArray[np.bool_]:
@@ -221,6 +228,8 @@ def by_reference(
         return found
 
     stays, begins = inside(strip.last_s), inside(strip.first_s)
+    for _ in range(decisions):
+        stays = stays | np.append(True, stays[:-1])
     orders, is_open = [], False
     for time_s, may_stay, may_begin in zip(
         at_s.tolist(), stays.tolist(), begins.tolist(), strict=True

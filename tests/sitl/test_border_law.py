@@ -24,9 +24,11 @@ FLIGHTS = 400 if os.environ.get("HYPOTHESIS_PROFILE") == "thorough" else 12
 FLOWN = settings(max_examples=FLIGHTS, phases=[Phase.explicit, Phase.generate])
 MOST_DEG_S = 120.0
 SLOWEST_M_S, FASTEST_M_S = 1.2, 10.0
-# An acceleration is believed within so long; where a closing takes seconds, it counts.
+# Where a closing takes seconds, half its square times the acceleration says when it is due, and no
+# message tells an acceleration: of a jump the filters have 20, 50, 70 and 85 % after one to four
+# messages, a small one later. The difference of the last two messages knows it one decision sooner
+# at most, and errs half as much again while nothing jumps (0.36 for 0.24 m/s2 rms, `flown`).
 BELIEVED_S = 0.3
-DECIDED_S = 0.05
 
 
 @st.composite
@@ -97,14 +99,14 @@ def flights(draw: st.DrawFn, *, slowest_s: float) -> Flight:
 @given(flight=flights(slowest_s=0.15))
 def test_valves_spray_no_more_outside_than_who_knows_the_true_state(flight: Flight) -> None:
     if shapely.area(flight.field) > 1.0:
-        assert worse_than_reference_m(flight, 0.0) <= MORE_M
+        assert worse_than_reference_m(flight) <= MORE_M
 
 
 @FLOWN
 @given(flight=flights(slowest_s=0.15))
 def test_noise_of_the_position_costs_no_more_than_one_decision(flight: Flight) -> None:
     if shapely.area(flight.field) > 1.0:
-        assert worse_than_reference_m(flight, DECIDED_S, noisy=True) <= MORE_M
+        assert worse_than_reference_m(flight, noisy=True, decisions=1) <= MORE_M
 
 
 @FLOWN
@@ -113,4 +115,5 @@ def test_what_takes_seconds_to_close_does_so_as_soon_as_an_acceleration_is_belie
     flight: Flight,
 ) -> None:
     if shapely.area(flight.field) > 1.0:
-        assert worse_than_reference_m(flight, BELIEVED_S) <= MORE_M
+        worse_m = worse_than_reference_m(flight, believed_s=BELIEVED_S, decisions=1)
+        assert worse_m <= MORE_M

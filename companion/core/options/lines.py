@@ -34,6 +34,9 @@ STAYS_S = 1.5
 # most, and may turn farther by a jerk as an autopilot's (ArduCopter's default; its simulated
 # vehicle had 5 to 9), which the filters see so much later.
 COURSE_AHEAD_S, JERK_M_S3, JERK_SEEN_S = 0.25, 5.0, 0.12
+# Of that only a share below this speed: else a sway of 0.06 m/s has valves of 0.25 s closed at up
+# to 1.2 m/s, and who is slow sprays on for a few centimetres only.
+SWERVES_M_S = 2.0
 # What closed at the tolerance opens again a tenth inside, so that noise does not make it chatter.
 ENTRY_SHARE = 0.9
 # Lines that begin where another ends lie within this of it, seen across.
@@ -114,8 +117,9 @@ class Lines:
         ve, vn = state.velocity_east_m_s, state.velocity_north_m_s
         soon_s = min(ends_s, COURSE_AHEAD_S)
         then_e, then_n = velocity_at(state, soon_s)
-        swerves = JERK_M_S3 * soon_s * (0.5 * soon_s + JERK_SEEN_S)
         speed = math.hypot(ve, vn)
+        swerves = JERK_M_S3 * soon_s * (0.5 * soon_s + JERK_SEEN_S)
+        swerves *= min(speed / SWERVES_M_S, 1.0)
         if not MOVING_M_S < speed <= SPEED_MAX_M_S:
             return ()
         aside = self.aside_m * (ENTRY_SHARE if entering else 1.0)
