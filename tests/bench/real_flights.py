@@ -237,7 +237,9 @@ Bars are those of missions in AUTO:
 
 Over the example's field, by GPIO, valves alike. *Drawn* is the vehicle with white position noise,
 *flown* the one fitted to these logs (`tools/studies/flown_vehicle.py`). An estimator that is 60 ms
-late is told to be.
+late is told to be. *Drawn* at 20 Hz, told the truth: 0.023 m, worst 0.10, so its targets leave no
+room for noise; most of it is dose, as changes of 12 to 20 % are off by 0.057 m, of 30 to 50 % by
+0.028. The speed 0.1 s ahead errs by 0.033 m/s (rms), by the best linear filter 0.031.
 
 {hidden}
 """
