@@ -119,7 +119,7 @@ class FlightRecord:
     asked for; none where that is not known. With `lines` only they were to be sprayed, with
     a `guard` no ground twice, nor what was `treated` by flights before. `unknown`
     has each valve's times, in order and apart, of which nobody can tell what was sprayed; it is
-    empty where all is known. `position_sd_m` is how far the positions that were told wander along
+    empty where all is known. `ferried` is when nothing was asked for, and nothing held the valves. `position_sd_m` is how far the positions that were told wander along
     one axis (1 sd), 0 where nobody knows.
     """
 
@@ -139,6 +139,7 @@ class FlightRecord:
     guard: OverlapGuard | None = None
     treated: Coverage | None = None
     unknown: tuple[Spans, ...] = ()
+    ferried: Spans = ()
     position_sd_m: float = 0.0
 
     def __post_init__(self) -> None:

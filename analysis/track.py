@@ -104,6 +104,8 @@ TURN_M = 10.0
 TURN_SHARE = 0.25
 # Following it is to be as far aside after three quarters of the visit as after one, or nearly: who
 # drifts from one edge of the tolerance to the other moves by a whole tolerance in between.
+# Of a line that was to be sprayed a part may have no rate.
+FERRY_SHARE = 0.9
 FOLLOWS_SHARE = 0.75
 
 
@@ -123,7 +125,8 @@ class PlannedLines:
         self._reach_m = lines.aside_m + max(
             abs(valve.right_m) + 0.5 * valve.width_m for valve in record.boom.valves
         )
-        self.visits = _visits(record, lines, self._pieces)
+        visits = _visits(record, lines, self._pieces)
+        self.visits = [each for each in visits if not _is_ferry(each, record)]
 
     def flown(self, time_s: Floats, east_m: Floats, north_m: Floats) -> Bools:
         """Return when a line is flown, and a point of the boom is between that line's ends."""
@@ -157,6 +160,13 @@ class PlannedLines:
         ends = np.column_stack([x0, y0, x0 + ue * length, y0 + un * length]).reshape(-1, 2, 2)
         strips = shapely.buffer(shapely.linestrings(ends), self._reach_m, cap_style="flat")
         return shapely.union_all(strips)
+
+
+def _is_ferry(visit: Visit, record: FlightRecord) -> bool:
+    """Return whether the way led along a line that it was not to spray, as of another sortie."""
+    start_s, end_s = visit.start_s, visit.end_s
+    idle_s = sum(max(min(b, end_s) - max(a, start_s), 0.0) for a, b in record.ferried)
+    return idle_s > FERRY_SHARE * (end_s - start_s)
 
 
 def _visits(record: FlightRecord, lines: Lines, pieces: Floats) -> list[Visit]:

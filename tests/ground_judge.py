@@ -243,13 +243,19 @@ def passed_of(flights: list[Truth], ground: Field) -> Any:
     found = []
     for truth in flights:
         reach_m = float((np.abs(truth.right_m) + truth.width_m / 2.0).max())
-        path = shapely.linestrings(np.column_stack([truth.east_m, truth.north_m])[::5])
+        way = np.column_stack([truth.east_m, truth.north_m])
+        path = shapely.linestrings(way[::5])
+        wet = way[1:][np.diff(truth.volume_ml.sum(axis=1)) > 0.0][::5]
         if not ground.lines:
             found.append(path.buffer(reach_m, cap_style="flat"))
         for line in ground.lines:
-            # Flown is a line that the reference followed for most of its length.
-            near = path.intersection(line.buffer(1.0, cap_style="flat"))
-            if near.length > 0.7 * line.length:
+            # Flown is a line that the reference followed for most of its length, and sprayed: a
+            # ferry may lead along a line of another sortie.
+            around = line.buffer(1.0, cap_style="flat")
+            there = shapely.points(wet[shapely.contains_xy(around, wet)])
+            metres = np.unique(np.floor(shapely.line_locate_point(line, there)))
+            is_wet = len(metres) > 0.3 * line.length
+            if is_wet and path.intersection(around).length > 0.7 * line.length:
                 found.append(line.buffer(reach_m, cap_style="flat"))
     return shapely.union_all(found)
 

@@ -22,6 +22,7 @@ from companion.errors import VrsprayError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from analysis.flight_record import Spans
     from analysis.flown.applied_flight import AppliedFlight, Floats
 
 Source = Literal["model", "meter"]
@@ -71,8 +72,18 @@ def record_of(
         nozzle_sets=() if makes_flow else setup.nozzle_sets,
         orders=executed_orders(flight),
         meta=_meta(flight),
+        ferried=_ferried(flight),
         unknown=with_gaps(flight.unknown, flight.time_s, valves=len(setup.boom.valves)),
     )
+
+
+def _ferried(flight: AppliedFlight) -> Spans:
+    """Return when nothing was asked for and nothing held the valves: the way led to no line."""
+    idle = np.isnan(flight.rate_l_ha).all(axis=1) & (flight.flow_l_min == 0.0)
+    idle &= np.array([not reasons for reasons in flight.inhibits], dtype=np.bool_)
+    edges = np.flatnonzero(np.diff(idle, prepend=False, append=False))
+    ends_s = np.append(flight.time_s, flight.time_s[-1:])[edges].tolist()
+    return tuple(zip(ends_s[::2], ends_s[1::2], strict=True))
 
 
 def modelled_ml(flight: AppliedFlight, time_s: Floats) -> Floats:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -308,6 +309,42 @@ def test_the_doses_of_a_job_are_sums_over_its_sorties(job: Job) -> None:
 
 def treated(job: Job) -> Treated:
     return treated_of(*(each.assessed.flight for each in job.flights))
+
+
+def test_a_ferry_along_a_line_of_another_sortie_is_no_flight_of_it(
+    job: Job, tmp_path: Path
+) -> None:
+    folder = tmp_path / "ferry"
+    shutil.copytree(job.journals[0].parents[1], folder)
+    plan = json.loads((folder / "field.plan").read_text())
+    lines = json.loads((folder / "field.lines.geojson").read_text())["features"]
+    of_third = [
+        np.array(each["geometry"]["coordinates"])
+        for each in lines
+        if (each["properties"].get("kind"), each["properties"].get("sortie")) == ("spray", 3)
+    ]
+    longest = max(of_third, key=lambda places: float(np.hypot(*(places[-1] - places[0]))))
+    begin, end = longest[0], longest[-1]
+    items = plan["mission"]["items"]
+    before = max(number for number, item in enumerate(items) if item["command"] == 16)
+    # From far before the line to far behind it: its own flight ends at the border.
+    for place in (end + 0.6 * (end - begin), begin - 0.6 * (end - begin)):
+        item = json.loads(json.dumps(items[before]))
+        item["params"][4:6] = [float(place[1]), float(place[0])]
+        items.insert(before + 1, item)
+    (folder / "ferry.plan").write_text(json.dumps(plan))
+    ferried, first = flown_of(folder, folder / "ferry.plan", folder / "ferried"), job.flights[0]
+    said, within = ferried.contents["verdict"], job.within
+    assert ferried.contents["flight"]["duration_s"] > first.contents["flight"]["duration_s"] + 30.0
+    assert ferried.verdict.missed_m2 == pytest.approx(first.verdict.missed_m2, **within)
+    assert said["missed_m2"] == pytest.approx(ferried.verdict.missed_m2, **within)
+    assert said["left_m2"] == pytest.approx(
+        ferried.verdict.bare_m2 - ferried.verdict.missed_m2, **within
+    )
+    # Nothing was asked there.
+    assert ferried.contents["misapplied_percent"] == pytest.approx(
+        first.contents["misapplied_percent"], abs=0.5
+    )
 
 
 @pytest.mark.parametrize("name", ["job.geojson", "job.shp", "job.kml", "job.parquet"])
