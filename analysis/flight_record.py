@@ -119,8 +119,9 @@ class FlightRecord:
     asked for; none where that is not known. With `lines` only they were to be sprayed, with
     a `guard` no ground twice, nor what was `treated` by flights before. `unknown`
     has each valve's times, in order and apart, of which nobody can tell what was sprayed; it is
-    empty where all is known. `ferried` is when nothing was asked for, and nothing held the valves. `position_sd_m` is how far the positions that were told wander along
-    one axis (1 sd), 0 where nobody knows.
+    empty where all is known. `ferried` is when nothing was asked for, and nothing held the valves.
+    `position_sd_m` is how far the positions that were told wander along one axis (1 sd), 0 where
+    nobody knows.
     """
 
     time_s: Floats
