@@ -10,6 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from companion.journal.journal import ROOM_WITHIN_S
 from tests.bench.faults.cases import Kind
 
 if TYPE_CHECKING:
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 
 # A companion that was not killed has so long to close, to finish its journal and to end.
 END_MAX_S = 8.0
+# Where the disk is full, it waits so long for room before it gives the record up.
+FULL_END_MAX_S = END_MAX_S + ROOM_WITHIN_S
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,7 +49,8 @@ async def finish(flight: Flight, said: asyncio.Task[tuple[bytes, bytes]]) -> End
     kill_engine(flight)
     out, err = b"", b""
     with suppress(TimeoutError):
-        out, err = await asyncio.wait_for(asyncio.shield(said), END_MAX_S)
+        end_s = FULL_END_MAX_S if kind is Kind.DISK_FULL else END_MAX_S
+        out, err = await asyncio.wait_for(asyncio.shield(said), end_s)
     lost = 0
     with suppress(ValueError, KeyError, TypeError):
         lost = int(json.loads(out)["lost_rows"])

@@ -20,8 +20,9 @@ Short passes of the real `vrspray run` in real time, one fault each at a random 
 
 - *GPIO*: the lines of a simulated chip, which release when their process dies, as a Raspberry Pi's
   do with `dtparam=strict_gpiod`. A chip that has gone is closed by the ALIVE line's monostable.
-  *Servo, script*: an autopilot with the watchdog script. *Servo, dither*: a driver board that
-  closes when its signal stops changing. Add one servo frame and the valve's own closing time.
+  *Servo*: the guardian, a process beside the companion, closes when that is killed or stopped.
+  Behind it stands an autopilot with the watchdog script (*script*), or a driver board that closes
+  when its signal stops changing (*dither*). Add one servo frame and the valve's own closing time.
 - *Closed after* counts from the message that reports the fault, from the signal or the loss of the
   link, or from the moment at which the limit of age is reached; 0: all were closed by then.
 - *Ordered outside* is what orders put outside the border, at the true position; *held outside* is
