@@ -74,7 +74,7 @@ class _Strip:
 class Deposit:
     """Volume on a raster of square cells over `bounds` (west, south, east, north) [m].
 
-    What falls beside the raster is counted in `beside_ml`, so that the sum is what was put out.
+    What falls beside the raster is counted too, so that the sum is what was put out.
     """
 
     def __init__(self, bounds: tuple[float, float, float, float], cell_m: float = 0.1) -> None:
@@ -94,11 +94,6 @@ class Deposit:
     def cells_ml(self) -> Floats:
         """Return the volume of each cell: rows from south, columns from west."""
         return self._cells_ml[:-1].reshape(self.rows, self.columns)
-
-    @property
-    def beside_ml(self) -> float:
-        """Return what fell beside the raster."""
-        return float(self._cells_ml[-1])
 
     @property
     def total_ml(self) -> float:

@@ -164,14 +164,6 @@ class BoardEdge(NamedTuple):
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Faults:
-    """Valves (by index) that do not follow their orders."""
-
-    stuck_open: frozenset[int] = frozenset()
-    stuck_closed: frozenset[int] = frozenset()
-
-
 class Flow(Protocol):
     """The flow of one outlet, integrated."""
 
@@ -269,14 +261,10 @@ class Plant:
         profile: PlantProfile,
         *,
         seed: int,
-        perfect: bool = False,
         start_s: float = 0.0,
-        faults: Faults | None = None,
     ) -> None:
         self.profile = profile
         self._check_kind()
-        self._perfect = perfect
-        self._faults = faults or Faults()
         rng = np.random.default_rng(seed)
         self._scatter = draw_scatter(profile, rng)
         self._table = flow_table(profile)
@@ -290,7 +278,7 @@ class Plant:
         self._late_s = [0.0] * count
         self._active = 0
         # What goes wrong in flight (`liquid_faults.py`): valves that stick, openings, the supply.
-        self._stuck = set(self._faults.stuck_open | self._faults.stuck_closed)
+        self._stuck: set[int] = set()
         self._ordered = [0.0] * count
         self._opening = [1.0] * count
         self._supply = 1.0
@@ -304,8 +292,6 @@ class Plant:
         self._stream: MeterStream | None = None
         what = profile.imperfections
         self._parts = None if what is None else Parts(what, count, seed=seed, start_s=start_s)
-        for valve in sorted(self._faults.stuck_open):
-            self._take(start_s, valve, duty=1.0, is_open=True)
 
     def _check_kind(self) -> None:
         """Refuse a sprayer whose flow is not made by its valves."""
@@ -314,20 +300,6 @@ class Plant:
                 f"the sprayer {self.profile.name} has a pump that makes the flow and no PWM "
                 "valves; fly it with `vrspray sitl fly`"
             )
-
-    def true_shift_s(self, valve: int) -> float:
-        """Return how much later this very valve is than the nominal one."""
-        self._check_perfect()
-        return self._scatter.shift_s[valve]
-
-    def true_flow_scale(self, valve: int) -> float:
-        """Return this very valve's flow over the nominal one: likewise."""
-        self._check_perfect()
-        return self._scatter.flow_scale[valve]
-
-    def _check_perfect(self) -> None:
-        if not self._perfect:
-            raise ValueError("only a plant made with perfect=True tells what cannot be known")
 
     def volume_ml(self, times_s: Floats) -> Floats:
         """Return (n, valves): what each valve has delivered up to each time."""
@@ -381,15 +353,6 @@ class Plant:
             per_ml=meter.pulses_per_l / 1000.0,
             factors=lambda count: state.factors(count, meter.noise).tolist(),
         )
-
-    def meter_flow_l_min(self, times_s: NDArray[np.floating]) -> Floats:
-        """Return the metered flow, mean of the PWM period before each time."""
-        period_s = self.profile.pwm.period_s
-        now_s: Floats = np.asarray(times_s, dtype=np.float64)
-        before_s: Floats = now_s - period_s
-        metered_ml = self.meter_volume_ml(now_s) - self.meter_volume_ml(before_s)
-        flow_l_min: Floats = metered_ml * (60.0 / 1000.0 / period_s)
-        return flow_l_min
 
     def _meter_from_s(self) -> float:
         return self._start_s + self._meter.index * self.profile.pwm.period_s

@@ -19,7 +19,6 @@ import numpy as np
 from sitl.drives import Approach
 from sitl.plant import (
     AveragedPlant,
-    Faults,
     Floats,
     Metering,
     MeterStream,
@@ -164,15 +163,11 @@ class PumpPlant(Plant):
         profile: PlantProfile,
         *,
         seed: int,
-        perfect: bool = False,
         start_s: float = 0.0,
-        faults: Faults | None = None,
     ) -> None:
         if profile.pump is None:
             raise ValueError(f"the sprayer {profile.name} has no pump that makes the flow")
-        super().__init__(profile, seed=seed, perfect=perfect, start_s=start_s)
-        if faults is not None and (faults.stuck_open or faults.stuck_closed):
-            raise ValueError("a pump has no valve that sticks")
+        super().__init__(profile, seed=seed, start_s=start_s)
         self._pump: Pump = profile.pump
         # This very pump is slower or quicker as a whole than the nominal one.
         scale = 1.0 + self._scatter.shift_s[0] / max(profile.mean_lag_s, 1e-9)
@@ -323,12 +318,10 @@ class _SuppliedMeter(MeterStream):
 class _Supplied(Plant):
     """What both fidelities share: the pump's pressure."""
 
-    def __init__(
-        self, profile: PlantProfile, *, seed: int, perfect: bool = False, start_s: float = 0.0
-    ) -> None:
+    def __init__(self, profile: PlantProfile, *, seed: int, start_s: float = 0.0) -> None:
         if profile.supply is None or profile.supply.control != "constant":
             raise ValueError(f"the sprayer {profile.name} has no constant pump")
-        super().__init__(profile, seed=seed, perfect=perfect, start_s=start_s)
+        super().__init__(profile, seed=seed, start_s=start_s)
         self._pump: Supply = profile.supply
         self.pressure = Approach(
             up_s=profile.supply.up_s, down_s=profile.supply.down_s, start_s=start_s

@@ -118,14 +118,6 @@ class Parts:
             * (1.0 + what.warming * -math.expm1(-since_s / what.warming_time_s))
         )
 
-    def flow_over_nominal(self, valve: int, period_s: float) -> float:
-        """Return the mean flow of a valve over the nominal one's, at two levels of duty."""
-        shares = []
-        for duty in (0.4, 0.75):
-            longer = 1.0 + self._longer_s[valve] / (duty * period_s)
-            shares.append(longer * (1.0 + self._bend[valve] * (duty - 0.5)))
-        return sum(shares) / len(shares)
-
     def late_s(self, valve: int, at_s: float, are_open: list[bool], *, is_open: bool) -> float:
         """Return how much later than the profile's an edge is."""
         what = self.what

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sitl.plant import Faults, Floats, MeterStream, Plant, VolumeMeter
+from sitl.plant import Floats, MeterStream, Plant, VolumeMeter
 from sitl.profile import ML_S_PER_L_MIN, flow_table
 from sitl.supply import Supply
 
@@ -31,16 +31,12 @@ class SectionPlant(Plant):
         profile: PlantProfile,
         *,
         seed: int,
-        perfect: bool = False,
         start_s: float = 0.0,
-        faults: Faults | None = None,
     ) -> None:
         supply = profile.supply
         if supply is None or supply.control != "modulates":
             raise ValueError(f"the sprayer {profile.name} has no pump that feeds sections")
-        if faults is not None and (faults.stuck_open or faults.stuck_closed):
-            raise ValueError("valves that stick are not simulated behind a pump")
-        super().__init__(profile, seed=seed, perfect=perfect, start_s=start_s)
+        super().__init__(profile, seed=seed, start_s=start_s)
         self._pump: Supply = supply
         self._pump_ml_s = flow_table(profile)
         scales = np.array(self._scatter.flow_scale)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -16,6 +15,7 @@ from analysis.published import P1_RESULTS
 from analysis.report.clock import duration_text
 from analysis.report.label import label_of
 from analysis.report.legal_fields import wind_note
+from companion.cli.answer import finite
 from companion.core.types import Inhibit
 from companion.simulated import SIMULATED
 
@@ -100,21 +100,6 @@ def contents_of(
     }  # fmt: skip
     cleaned: dict[str, Any] = finite(contents)
     return cleaned
-
-
-def finite(value: Any) -> Any:
-    """Return a value as JSON has it: what is no finite number is missing.
-
-    >>> finite({"a": [float("nan"), 1.0]})
-    {'a': [None, 1.0]}
-    """
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, Mapping):
-        return {key: finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(item) for item in value]
-    return value
 
 
 def table_5(groups: Sequence[AccuracyGroup]) -> dict[str, Any]:

@@ -32,7 +32,7 @@ Overrides = Annotated[
 def answer(result: Mapping[str, Any], lines: Iterable[str], *, as_json: bool) -> None:
     """Print the result on stdout: one JSON object, or lines for a person."""
     if as_json:
-        typer.echo(json.dumps(_finite(result), allow_nan=False))
+        typer.echo(json.dumps(finite(result), allow_nan=False))
         return
     for line in lines:
         typer.echo(_one(line), file=terminal(sys.stdout) if isinstance(line, Styled) else None)
@@ -67,14 +67,18 @@ def problem_object(problem: Problem) -> dict[str, str]:
     }
 
 
-def _finite(value: Any) -> Any:
-    """Return a value that JSON has: no NaN, no infinity."""
+def finite(value: Any) -> Any:
+    """Return a value as JSON has it: what is no finite number is missing.
+
+    >>> finite({"a": [float("nan"), 1.0]})
+    {'a': [None, 1.0]}
+    """
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, Mapping):
-        return {key: _finite(item) for key, item in value.items()}
+        return {key: finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
+        return [finite(item) for item in value]
     return value
 
 

@@ -106,15 +106,6 @@ def body_axes(heading_deg: float) -> tuple[tuple[float, float], tuple[float, flo
     return (sin, cos), (cos, -sin)
 
 
-def width_across_course_m(width_m: float, *, heading_deg: float, course_deg: float) -> float:
-    """Return the width of a strip measured across the motion: width |cos(heading - course)|.
-
-    >>> round(width_across_course_m(6.0, heading_deg=60.0, course_deg=0.0), 6)
-    3.0
-    """
-    return width_m * abs(math.cos(math.radians(heading_deg - course_deg)))
-
-
 # Where each point of the boom will be: the predicted motion as chords, one on a straight pass.
 
 # Below these, the estimate of a turn is mostly noise. What it leaves out: in the 0.3 s that an

@@ -7,7 +7,6 @@ stopped first, which orders every output closed.
 from __future__ import annotations
 
 import asyncio
-import logging
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AsyncExitStack, suppress
@@ -29,8 +28,6 @@ from companion.ground.work import (
     observe_ground,
 )
 from companion.ports import PlanExecutor, Sensor, VehicleLink
-
-_logger = logging.getLogger(__name__)
 
 STEP_S = 0.05
 WAIT_S = 10.0

@@ -374,16 +374,8 @@ class _Connection(asyncio.Protocol):
 class TcpTransport(Reconnecting):
     """A client; a peer that reads too slowly gets nothing rather than old orders."""
 
-    def __init__(
-        self,
-        url: LinkUrl,
-        on_bytes: OnBytes,
-        on_change: OnChange,
-        on_trouble: OnTrouble | None = None,
-    ) -> None:
-        super().__init__(url, on_bytes, on_change, on_trouble)
-        self._transport: asyncio.Transport | None = None
-        self._connection: _Connection | None = None
+    _transport: asyncio.Transport | None = None
+    _connection: _Connection | None = None
 
     async def _connect(self) -> None:
         loop = asyncio.get_running_loop()

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import logging
 import socket
 import sys
 import time
@@ -22,8 +21,6 @@ from companion.core.types import SprayPlan
 from companion.output.autopilot_options import ServoOptions
 from companion.output.child import RECEIVE_MAX, Child
 from companion.output.servo import Order, ServoExecutor
-
-_logger = logging.getLogger(__name__)
 
 COMMAND = (sys.executable, "-P", "-m", "companion.guardian")
 START_MAX_S = 10.0
@@ -93,11 +90,6 @@ class GuardedServoExecutor(ServoExecutor):
     def fault(self) -> str | None:
         """Why the outputs cannot be trusted, or closed without us."""
         return super().fault or self._unguarded
-
-    @property
-    def guardian_pid(self) -> int | None:
-        """Return the process id of the guardian."""
-        return None if self._child is None else self._child.pid
 
     def met(self, is_px4: bool) -> Any:
         """Take that the vehicle was met: the guardian has to know by which orders it closes."""

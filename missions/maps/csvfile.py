@@ -60,15 +60,21 @@ def read_csv(path: Path, layer: str | None = None) -> Layer | Grid:
     if layer is not None:
         raise map_error(path, "CSV has no layers", fix="leave out --layer", code="no-layer")
     content = read_bytes(path)
+    table, place = _placed(content, path)
+    sha256 = digest([content])
+    if len(place) == 1:
+        return _layer(table, place[0], sha256)
+    return _grid(table, place, sha256)
+
+
+def _placed(content: bytes, path: Path) -> tuple[Table, tuple[str, ...]]:
+    """Return the table, and its column of polygons or its two of places."""
     table = read_table(content, path, wanted=lambda names: bool(_place_columns(names)))
     place = _place_columns(tuple(table.columns))
     if len(place) == 1 and not any(map(_AREA.match, table.columns[place[0]])):
         # Programs that write a point's geometry as text write its latitude and longitude too.
         place = _place_columns([name for name in table.columns if name not in place]) or place
-    sha256 = digest([content])
-    if len(place) == 1:
-        return _layer(table, place[0], sha256)
-    return _grid(table, place, sha256)
+    return table, place
 
 
 def read_point_table(path: Path) -> tuple[Floats, CRS | None, dict[str, Floats]] | None:
@@ -76,13 +82,7 @@ def read_point_table(path: Path) -> tuple[Floats, CRS | None, dict[str, Floats]]
 
     None for a file of polygons.
     """
-    content = read_bytes(path)
-    table = read_table(content, path, wanted=lambda names: bool(_place_columns(names)))
-    place = _place_columns(tuple(table.columns))
-    if len(place) == 1:
-        if any(map(_AREA.match, table.columns[place[0]])):
-            return None
-        place = _place_columns([name for name in table.columns if name not in place]) or place
+    table, place = _placed(read_bytes(path), path)
     if len(place) == 1:
         return None
     x, y = (_coordinates(table, name) for name in place)

@@ -293,12 +293,11 @@ NODATA = -9999.0
 _ROOT = "DJI"
 
 
-def write_geotiff(cells: MapCells, path: Path, *, boundary: MultiPolygon | None = None) -> None:
+def write_geotiff(cells: MapCells, path: Path) -> None:
     """Write cells of any CRS as GeoTIFF, with a world file beside it.
 
     A GeoTIFF has no place for the outline of the field; `write_dji` keeps it.
     """
-    del boundary
     picture, world = _content(cells, path)
     write_whole(path, picture)
     write_whole(path.with_suffix(".tfw"), world)

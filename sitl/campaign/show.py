@@ -138,13 +138,9 @@ class Rows:
 
     def by_point(self, values: Floats, chosen: NDArray[np.bool_]) -> Floats:
         """Return the mean of each setting among the chosen rows; NaN where no flight has one."""
-        _, place = np.unique(self.point[chosen], return_inverse=True)
-        known = ~np.isnan(values[chosen])
-        count = np.bincount(place[known], minlength=place.max(initial=-1) + 1)
-        total = np.bincount(
-            place[known], weights=values[chosen][known], minlength=place.max(initial=-1) + 1
-        )
-        means: Floats = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+        table = _table(self.point[chosen], self.seed[chosen], values[chosen])
+        count = (~np.isnan(table)).sum(axis=1)
+        means: Floats = np.where(count, np.nansum(table, axis=1) / np.maximum(count, 1), np.nan)
         return means
 
 

@@ -13,7 +13,7 @@ from sitl.stub import commands
 from sitl.stub.commands import ACCEPTED, DENIED, FAILED, current
 from sitl.stub.faults import FaultKind
 from sitl.stub.firmware import Builder, CommandHandler, Firmware, MessageHandler, Params, Version
-from sitl.stub.mission_items import LAND, LOITER, RTL, refused_by_ardupilot
+from sitl.stub.mission_items import refused_by_ardupilot
 from sitl.stub.outputs import ServoOutputs
 from sitl.stub.protocol import Message, dialect
 from sitl.stub.streams import COMMON, HEALTHY, LOST, estimated, version_word
@@ -103,26 +103,16 @@ def _set_interval(autopilot: Autopilot, channel: Channel, params: Params, now_s:
 
 
 COMMANDS: Mapping[int, CommandHandler] = {
+    **commands.shared(refused=FAILED, unknown=FAILED),
     dialect.MAV_CMD_COMPONENT_ARM_DISARM: _arm,
     dialect.MAV_CMD_DO_SET_MODE: _set_mode,
     dialect.MAV_CMD_NAV_TAKEOFF: _take_off,
-    dialect.MAV_CMD_NAV_LAND: commands.to_mode(LAND, refused=FAILED),
-    dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH: commands.to_mode(RTL, refused=FAILED),
-    dialect.MAV_CMD_NAV_LOITER_UNLIM: commands.to_mode(LOITER, refused=FAILED),
     dialect.MAV_CMD_MISSION_START: _start_mission,
     dialect.MAV_CMD_DO_SET_MISSION_CURRENT: commands.set_current,
     dialect.MAV_CMD_DO_SET_SERVO: _set_servo,
     dialect.MAV_CMD_DO_SET_RELAY: _set_relay,
     dialect.MAV_CMD_DO_SPRAYER: _sprayer,
-    dialect.MAV_CMD_DO_CHANGE_SPEED: commands.change_speed,
     dialect.MAV_CMD_SET_MESSAGE_INTERVAL: _set_interval,
-    dialect.MAV_CMD_GET_MESSAGE_INTERVAL: commands.get_interval,
-    dialect.MAV_CMD_REQUEST_MESSAGE: commands.request(FAILED),
-    dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: commands.request_fixed(
-        dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION
-    ),
-    dialect.MAV_CMD_GET_HOME_POSITION: commands.request_fixed(dialect.MAVLINK_MSG_ID_HOME_POSITION),
-    dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: commands.reboot,
 }
 
 

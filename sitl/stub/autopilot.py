@@ -564,10 +564,6 @@ def forward(autopilot: Autopilot, origin: Channel, message: Message) -> None:
 
 SCRIPT_PERIOD_S = 0.02
 
-_MAVLINK2 = 0xFD
-_PAYLOAD_SIZE = 264  # payload64[33] of mavlink_message_t
-_TAIL_SIZE = 2 + 13  # checksum as received, signature
-
 
 class Script(Protocol):
     """What a script has to offer; it gets `Autopilot.set_output` from whoever makes it."""
@@ -577,19 +573,3 @@ class Script(Protocol):
 
     def update(self, now_s: float) -> None:
         """Do what is due; called every 20 ms."""
-
-
-def as_message_struct(frame: bytes) -> bytes:
-    """Return a frame as `mavlink_message_t`, which is what `mavlink:receive_chan` gives to Lua.
-
-    checksum (2), start, length, two flags, sequence, system, component, id (3), payload filled
-    with zeros, checksum, signature: counted from 1, the component is byte 9.
-    """
-    if frame[0] == _MAVLINK2:
-        head, payload = frame[:10], frame[10 : 10 + frame[1]]
-    else:
-        head = bytes((frame[0], frame[1], 0, 0, *frame[2:6], 0, 0))
-        payload = frame[6 : 6 + frame[1]]
-    end = (10 if frame[0] == _MAVLINK2 else 6) + frame[1]
-    checksum = frame[end : end + 2]
-    return checksum + head + payload.ljust(_PAYLOAD_SIZE, b"\0") + checksum.ljust(_TAIL_SIZE, b"\0")

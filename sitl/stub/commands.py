@@ -14,7 +14,17 @@ from typing import TYPE_CHECKING
 
 from sitl.stub.faults import FaultKind
 from sitl.stub.firmware import CommandHandler, Params, Upload
-from sitl.stub.mission_items import AUTO, WARNING, MissionItem, Phase, item_message, item_of
+from sitl.stub.mission_items import (
+    AUTO,
+    LAND,
+    LOITER,
+    RTL,
+    WARNING,
+    MissionItem,
+    Phase,
+    item_message,
+    item_of,
+)
 from sitl.stub.parameters import SPEED_MAX_M_S, SPEED_MIN_M_S
 from sitl.stub.protocol import AUTOPILOT_SYSTEM, Message, dialect, sender
 
@@ -107,6 +117,23 @@ def reboot(autopilot: Autopilot, _channel: Channel, params: Params, now_s: float
         return FAILED
     autopilot.reboot(now_s)
     return ACCEPTED
+
+
+def shared(*, refused: int, unknown: int) -> dict[int, CommandHandler]:
+    """Return the commands of both autopilots; they differ in how they refuse."""
+    return {
+        dialect.MAV_CMD_NAV_LAND: to_mode(LAND, refused=refused),
+        dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH: to_mode(RTL, refused=refused),
+        dialect.MAV_CMD_NAV_LOITER_UNLIM: to_mode(LOITER, refused=refused),
+        dialect.MAV_CMD_DO_CHANGE_SPEED: change_speed,
+        dialect.MAV_CMD_GET_MESSAGE_INTERVAL: get_interval,
+        dialect.MAV_CMD_REQUEST_MESSAGE: request(unknown),
+        dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: request_fixed(
+            dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION
+        ),
+        dialect.MAV_CMD_GET_HOME_POSITION: request_fixed(dialect.MAVLINK_MSG_ID_HOME_POSITION),
+        dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: reboot,
+    }
 
 
 def handle_long(autopilot: Autopilot, channel: Channel, message: Message, now_s: float) -> None:

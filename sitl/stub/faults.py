@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from enum import StrEnum
 from pathlib import Path
@@ -167,10 +168,15 @@ def read_table(path: Path) -> dict[str, Any]:
 
 def read_faults(path: Path, table: dict[str, Any]) -> tuple[Fault, ...]:
     """Return the faults of a scenario."""
-    entries = table.get("fault", [])
+    return tuple(_fault(path, number, each) for number, each in tables_of(path, table, "fault"))
+
+
+def tables_of(path: Path, table: dict[str, Any], name: str) -> Iterable[tuple[int, dict[str, Any]]]:
+    """Return the numbered tables [[name]] of a scenario."""
+    entries = table.get(name, [])
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise ConfigError(f"{path}: fault: write it as [[fault]], one table each")
-    return tuple(_fault(path, number, entry) for number, entry in enumerate(entries))
+        raise ConfigError(f"{path}: {name}: write it as [[{name}]], one table each")
+    return enumerate(entries)
 
 
 def _fault(path: Path, number: int, entry: dict[str, Any]) -> Fault:

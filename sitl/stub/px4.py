@@ -111,23 +111,13 @@ def _set_interval(autopilot: Autopilot, channel: Channel, params: Params, now_s:
 
 
 COMMANDS: Mapping[int, CommandHandler] = {
+    **commands.shared(refused=REJECTED, unknown=DENIED),
     dialect.MAV_CMD_COMPONENT_ARM_DISARM: _arm,
     dialect.MAV_CMD_DO_SET_MODE: _set_mode,
     dialect.MAV_CMD_NAV_TAKEOFF: _take_off,
-    dialect.MAV_CMD_NAV_LAND: commands.to_mode(LAND, refused=REJECTED),
-    dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH: commands.to_mode(RTL, refused=REJECTED),
-    dialect.MAV_CMD_NAV_LOITER_UNLIM: commands.to_mode(LOITER, refused=REJECTED),
     dialect.MAV_CMD_MISSION_START: _start_mission,
     DO_SET_ACTUATOR: _answer_actuators,
-    dialect.MAV_CMD_DO_CHANGE_SPEED: commands.change_speed,
     dialect.MAV_CMD_SET_MESSAGE_INTERVAL: _set_interval,
-    dialect.MAV_CMD_GET_MESSAGE_INTERVAL: commands.get_interval,
-    dialect.MAV_CMD_REQUEST_MESSAGE: commands.request(DENIED),
-    dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: commands.request_fixed(
-        dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION
-    ),
-    dialect.MAV_CMD_GET_HOME_POSITION: commands.request_fixed(dialect.MAVLINK_MSG_ID_HOME_POSITION),
-    dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: commands.reboot,
 }
 
 # The receiver answers these itself; the others go to the Commander through its queue.

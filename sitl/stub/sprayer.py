@@ -23,6 +23,7 @@ from sitl.liquid_faults import LiquidFault, LiquidFaultKind, LiquidSensors
 from sitl.outputs import SERVO_FRAME_S, DriverBoard
 from sitl.plants import edge_plant
 from sitl.profile import FlowLaw, load_profile
+from sitl.stub.faults import tables_of
 from sitl.stub.outputs import ServoOrder
 
 if TYPE_CHECKING:
@@ -76,10 +77,7 @@ class LiquidEntry:
 
 def read_liquid(path: Path, table: dict[str, Any]) -> tuple[LiquidEntry, ...]:
     """Return the faults of the liquid of a scenario."""
-    entries = table.get("liquid", [])
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise ConfigError(f"{path}: liquid: write it as [[liquid]], one table each")
-    return tuple(_entry(path, number, entry) for number, entry in enumerate(entries))
+    return tuple(_entry(path, number, each) for number, each in tables_of(path, table, "liquid"))
 
 
 def _entry(path: Path, number: int, entry: dict[str, Any]) -> LiquidEntry:

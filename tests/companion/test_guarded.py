@@ -147,7 +147,7 @@ async def test_the_end_takes_the_guardian_along_even_where_nothing_can_be_ordere
         with pytest.raises(OSError, match="the link broke"):
             await found.executor.stop()
         assert child._process.returncode == 0
-        assert found.executor.guardian_pid is None
+        assert found.executor._child is None
 
 
 async def test_word_that_an_earlier_guardian_left_is_told_once(tmp_path: Path) -> None:

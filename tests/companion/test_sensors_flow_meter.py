@@ -16,7 +16,8 @@ from companion.cli.sensor_parts import GpiodEdges
 from companion.core.types import FlowReport
 from companion.errors import SensorError
 from companion.output.engine import lines
-from companion.sensors import Edge, FlowMeter, Meter, PulseCounter, VirtualEdges
+from companion.sensors import Edge, FlowMeter, Meter, PulseCounter
+from tests.virtual_edges import VirtualEdges
 
 PERIOD_S = 1.0 / 11.0
 METER = Meter(pulses_per_l=4600.0, flow_max_l_min=12.0, pwm_period_s=PERIOD_S)

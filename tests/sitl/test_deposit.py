@@ -36,14 +36,14 @@ def test_all_that_leaves_the_valves_is_on_the_ground() -> None:
     deposit = Deposit((-5.0, -5.0, 25.0, 5.0))
     litres_ml = straight(deposit, SIX).sum()
     assert deposit.total_ml == pytest.approx(litres_ml, rel=1e-12)
-    assert deposit.beside_ml == 0.0
+    assert deposit._cells_ml[-1] == 0.0
 
 
 def test_what_falls_beside_the_raster_is_counted() -> None:
     deposit = Deposit((0.0, -5.0, 10.0, 5.0))
     litres_ml = straight(deposit, SIX).sum()
     assert deposit.total_ml == pytest.approx(litres_ml, rel=1e-12)
-    assert deposit.beside_ml == pytest.approx(litres_ml / 2, rel=0.01)
+    assert deposit._cells_ml[-1] == pytest.approx(litres_ml / 2, rel=0.01)
 
 
 def test_the_rate_on_the_ground_is_flow_over_speed_and_width() -> None:

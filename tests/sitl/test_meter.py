@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from companion.output.pwm import Edge
-from sitl.plant import AveragedPlant, Faults, Plant, PulsedPlant
+from sitl.plant import AveragedPlant, Plant, PulsedPlant
 from sitl.profile import load_profile
 
 PROFILE = load_profile("wang-2024")
@@ -31,12 +31,12 @@ def edges(plant: PulsedPlant, at_s: float) -> None:
 def test_the_meter_read_in_passing_counts_as_the_one_read_afterwards(
     fidelity: str, rate_hz: float
 ) -> None:
-    faults = Faults(stuck_open=frozenset({1}))
     plant: Plant
     if fidelity == "averaged":
-        plant = AveragedPlant(NOISY, seed=3, start_s=-1.0, faults=faults)
+        plant = AveragedPlant(NOISY, seed=3, start_s=-1.0)
     else:
-        plant = PulsedPlant(NOISY, seed=3, start_s=-1.0, faults=faults)
+        plant = PulsedPlant(NOISY, seed=3, start_s=-1.0)
+    plant.stick(-1.0, 1, is_open=True)
     counter = plant.meter_counter()
     times_s = np.arange(0.0, 40.0, 1.0 / rate_hz)
     seen, at_s = [], 0.0

@@ -8,7 +8,7 @@ import pytest
 from companion.core.types import SprayPlan, TimedChange
 from companion.output.pwm import Edge, PulseEngine
 from sitl.knowledge import pwm_limits
-from sitl.plant import AveragedPlant, Faults, Plant, PulsedPlant
+from sitl.plant import AveragedPlant, Floats, Plant, PulsedPlant
 from sitl.profile import ML_S_PER_L_MIN, flow_table, load_profile
 
 WANG = load_profile("wang-2024")
@@ -20,7 +20,7 @@ GRID_S = np.arange(400) / 400.0 * 3.0 * T
 def pulsed(
     old: float, new: float, at_s: float, *, seed: int = 1, until_s: float = 9.0
 ) -> PulsedPlant:
-    plant = PulsedPlant(WANG, seed=seed, perfect=True)
+    plant = PulsedPlant(WANG, seed=seed)
     engine = PulseEngine(pwm_limits(WANG), 6, start_s=0.0)
     changes = tuple(TimedChange(at_s=at_s, valve=v, duty=new) for v in range(6))
     plan = SprayPlan(
@@ -32,17 +32,24 @@ def pulsed(
 
 
 def averaged(old: float, new: float, at_s: float, *, seed: int = 1) -> AveragedPlant:
-    plant = AveragedPlant(WANG, seed=seed, perfect=True)
+    plant = AveragedPlant(WANG, seed=seed)
     for duty, time_s in ((old, 0.0), (new, at_s)):
         for valve in range(6):
             plant.record_change(time_s, valve, duty)
     return plant
 
 
+def metered_l_min(plant: Plant, times_s: Floats) -> Floats:
+    """Return the metered flow, mean of the PWM period before each time."""
+    metered_ml = plant.meter_volume_ml(times_s) - plant.meter_volume_ml(times_s - T)
+    flow_l_min: Floats = metered_ml * (60.0 / 1000.0 / T)
+    return flow_l_min
+
+
 def lag_of(plant: Plant, valve: int, old: float, new: float, at_s: float) -> float:
     """Return the volume-equivalent lag: where the lines of the volume before and after meet."""
     table = flow_table(WANG)
-    scale = plant.true_flow_scale(valve) if plant._perfect else 1.0
+    scale = plant._scatter.flow_scale[valve]
     flow_0 = table.mean_ml_s(old, 6) * scale
     flow_1 = table.mean_ml_s(new, 6) * scale
     before_s, after_s = at_s - 0.5 - 3.0 * T + GRID_S, at_s + 2.5 + GRID_S
@@ -101,7 +108,7 @@ def test_both_fidelities_have_the_same_lag_of_about_a_tenth_of_a_second(
 def test_the_lag_of_a_valve_is_what_the_perfect_plant_says() -> None:
     plant = averaged(0.5, 0.7, 3.0, seed=4)
     for valve in range(6):
-        expected = WANG.mean_lag_s + plant.true_shift_s(valve)
+        expected = WANG.mean_lag_s + plant._scatter.shift_s[valve]
         assert lag_of(plant, valve, 0.5, 0.7, 3.0) == pytest.approx(expected, abs=1e-4)
 
 
@@ -115,26 +122,10 @@ def test_flow_starts_after_the_opening_dead_time_and_ends_after_closing_and_ramp
     assert volume_ml[4] == pytest.approx(volume_ml[3], abs=1e-9)
 
 
-def test_knowledge_of_the_plant_is_for_the_perfect_run_only() -> None:
-    plant = PulsedPlant(WANG, seed=1)
-    with pytest.raises(ValueError, match="perfect"):
-        plant.true_shift_s(0)
-    with pytest.raises(ValueError, match="perfect"):
-        plant.true_flow_scale(0)
-
-
-def test_perfect_knowledge_changes_no_flow() -> None:
-    times_s = np.linspace(0.0, 8.0, 50)
-    plain = AveragedPlant(WANG, seed=9)
-    told = AveragedPlant(WANG, seed=9, perfect=True)
-    for plant in (plain, told):
-        plant.record_change(0.5, 2, 0.6)
-    assert np.array_equal(plain.volume_ml(times_s), told.volume_ml(times_s))
-
-
 def test_a_valve_stuck_closed_never_flows_and_one_stuck_open_always_does() -> None:
-    faults = Faults(stuck_open=frozenset({1}), stuck_closed=frozenset({2}))
-    plant = AveragedPlant(EVEN, seed=1, faults=faults)
+    plant = AveragedPlant(EVEN, seed=1)
+    plant.stick(0.0, 1, is_open=True)
+    plant.stick(0.0, 2, is_open=False)
     for valve in range(6):
         plant.record_change(0.0, valve, 0.5)
         plant.record_change(2.0, valve, 0.0)
@@ -151,9 +142,7 @@ def test_forgetting_the_past_changes_nothing_of_the_present(kind: type) -> None:
     for before_s in (1.0, 2.5, 3.5):
         short.forget(before_s)
     assert short.volume_ml(times_s) == pytest.approx(whole.volume_ml(times_s), abs=1e-7)
-    assert short.meter_flow_l_min(times_s) == pytest.approx(
-        whole.meter_flow_l_min(times_s), abs=1e-7
-    )
+    assert metered_l_min(short, times_s) == pytest.approx(metered_l_min(whole, times_s), abs=1e-7)
     assert np.array_equal(short.meter_count(times_s), whole.meter_count(times_s))
     with pytest.raises(ValueError, match="forgotten"):
         short.volume_ml(np.array([1.0]))
@@ -164,7 +153,7 @@ def test_the_meter_is_off_by_its_gain_and_a_little_noise() -> None:
     for seed in range(30):
         plant = averaged(0.0, 0.7, 0.1, seed=seed)
         times_s = 2.0 + T * np.arange(60)
-        ratio = plant.meter_flow_l_min(times_s) / nominal_l_min(0.7, 6)
+        ratio = metered_l_min(plant, times_s) / nominal_l_min(0.7, 6)
         gains.append(float(ratio.mean()))
         assert 0.003 < np.std(ratio) < 0.02
     assert 0.96 < min(gains) < 0.985 < 1.015 < max(gains) < 1.04

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 
-from sitl.stub.autopilot import as_message_struct
 from sitl.stub.faults import Fault, FaultKind
 from sitl.stub.outputs import ServoOrder
-from sitl.stub.protocol import Speaker, dialect
+from sitl.stub.protocol import dialect
 from sitl.stub.scenario import Scenario
 from sitl.stub.sprayer import ArmingBox, Sprayer, SprayerOptions
 from tests.sitl.stub_bench import Bench
@@ -145,19 +143,6 @@ def test_a_script_hears_runs_every_20_ms_and_writes(autopilot: str) -> None:
     closed = [order for order in bench.orders if order.channel == 9 and order.pulse_us == 1000]
     assert 0.19 <= closed[0].at_s - died_s < 0.26
     assert script.frames[0][0] == 0xFD
-
-
-def test_the_struct_of_a_script_has_the_component_at_byte_9() -> None:
-    message: Any = dialect.MAVLink_named_value_float_message(77, b"SPR_LIVE", 1.0)
-    frame = Speaker(1, 191).frame(message)
-    struct = as_message_struct(frame)
-    assert len(struct) == 291
-    assert (struct[8 - 1], struct[9 - 1]) == (1, 191)
-    assert int.from_bytes(struct[9:12], "little") == dialect.MAVLINK_MSG_ID_NAMED_VALUE_FLOAT
-    assert struct[12 : 12 + frame[1]] == frame[10:-2]
-    old = as_message_struct(Speaker(1, 191).frame(message, mavlink1=True))
-    assert (len(old), old[7], old[8], old[9]) == (291, 1, 191, 251)
-    assert old[12:30] == struct[12:30]
 
 
 # ------------------------------------------------------------------------------------------- box

@@ -14,8 +14,6 @@ from analysis.dose import (
     RateAccuracy,
     accuracy_by_rate,
     flow_accuracy,
-    pooled_by_rate,
-    pooled_percent,
 )
 from analysis.evaluation import Distances
 from analysis.published import (
@@ -45,6 +43,8 @@ from tools.studies.validation_flights import (
     Row,
     Validation,
     pooled,
+    pooled_by_rate,
+    pooled_percent,
     validate,
 )
 

@@ -35,13 +35,15 @@ from companion.core.types import BatteryReport, Input
 from companion.ground.shell import GroundOutcome
 from companion.ground.work import PIECE_MAX_S, GroundReason, GroundTask
 from companion.link.component import Component, ComponentOptions
-from companion.sensors import Meter, VirtualEdges
+from companion.sensors import Meter
 from sitl.flight import FlightOptions
 from sitl.profile import Imperfections, Parts, PlantProfile, draw_scatter, load_profile
 from sitl.stub.sprayer import FLIGHT_BATTERY, Battery
 from sitl.valve_calibration import calibrate_valves, recorded, with_figures
 from tests.bench.sprayers import options_of, sprayer_setup
+from tests.bench.valves import flow_over_nominal
 from tests.sitl import stub_bench
+from tests.virtual_edges import VirtualEdges
 
 ANYANG = Path(__file__).parents[2] / "examples" / "anyang" / "config.toml"
 NAMES = ("1", "2", "3", "4", "5", "6")
@@ -321,7 +323,7 @@ def test_a_factor_is_right_at_both_levels_of_a_valve_that_delivers_longer_at_eve
     parts = Parts(what, 6, seed=4, start_s=0.0)
     for valve, own in enumerate(found.valves):
         assert own.factor.value == pytest.approx(
-            parts.flow_over_nominal(valve, bent.pwm.period_s), abs=0.004
+            flow_over_nominal(parts, valve, bent.pwm.period_s), abs=0.004
         )
 
 

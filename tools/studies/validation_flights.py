@@ -20,7 +20,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, Literal
 
-from analysis.dose import RateAccuracy, pooled_by_rate, pooled_percent
+from analysis.dose import RateAccuracy
 from analysis.evaluation import Distances
 from analysis.published import (
     P1_RATES_L_HA,
@@ -71,6 +71,34 @@ LOOK_AHEAD, BY_TABLE = (
 )
 # What is flown; the pictures show `WAYS`.
 EVERY_WAY = (*WAYS, BY_TABLE)
+
+
+def pooled_by_rate(flights: Iterable[Iterable[RateAccuracy]]) -> tuple[RateAccuracy, ...]:
+    """Return the rows of all flights together, as if they had been one."""
+    by_rate: dict[float | None, list[RateAccuracy]] = {}
+    for flight in flights:
+        for row in flight:
+            by_rate.setdefault(row.rate_l_ha, []).append(row)
+    ordered = sorted(by_rate, key=lambda rate: float("inf") if rate is None else rate)
+    pooled = []
+    for rate in ordered:
+        percent = pooled_percent(by_rate[rate])
+        if percent is not None:
+            samples = sum(row.samples for row in by_rate[rate])
+            pooled.append(RateAccuracy(rate_l_ha=rate, percent=percent, samples=samples))
+    return tuple(pooled)
+
+
+def pooled_percent(rows: Iterable[RateAccuracy]) -> float | None:
+    """Return the SA of all data points of some rows; None without any.
+
+    >>> low = RateAccuracy(rate_l_ha=10.0, percent=90.0, samples=1)
+    >>> pooled_percent([low, RateAccuracy(rate_l_ha=20.0, percent=98.0, samples=3)])
+    96.0
+    """
+    each = list(rows)
+    samples = sum(row.samples for row in each)
+    return sum(row.percent * row.samples for row in each) / samples if samples else None
 
 
 def pooled(flights: Iterable[Distances]) -> Distances:

@@ -10,6 +10,7 @@ import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 
 import shapely
@@ -56,29 +57,15 @@ def keeps_cells(map_file: MapFile, wish: Wish) -> bool:
     return is_wgs84(map_file.cells.crs) and a > 0.0 and b == d == 0.0
 
 
-def _shapefile(map_file: MapFile, path: Path, _: Wish) -> None:
-    from missions.maps.shapefile import write_shapefile
+def _zones(name: str, *, clip: bool = False) -> Callable[[MapFile, Path, Wish], None]:
+    """Return what writes zones and the field's outline, loaded when it is wanted."""
 
-    # Beside the zones a zip has the boundary too, but few programs heed it.
-    write_shapefile(plain_zones(map_file, clip=True), path, boundary=_boundary(map_file))
+    def write(map_file: MapFile, path: Path, _: Wish) -> None:
+        writer = getattr(import_module(f"missions.maps.{name}"), f"write_{name}")
+        boundary = None if map_file.boundary is None else _sound(map_file.boundary)
+        writer(plain_zones(map_file, clip=clip), path, boundary=boundary)
 
-
-def _geojson(map_file: MapFile, path: Path, _: Wish) -> None:
-    from missions.maps.geojson import write_geojson
-
-    write_geojson(plain_zones(map_file, clip=False), path, boundary=_boundary(map_file))
-
-
-def _geopackage(map_file: MapFile, path: Path, _: Wish) -> None:
-    from missions.maps.geopackage import write_geopackage
-
-    write_geopackage(plain_zones(map_file, clip=False), path, boundary=_boundary(map_file))
-
-
-def _kml(map_file: MapFile, path: Path, _: Wish) -> None:
-    from missions.maps.kml import write_kml
-
-    write_kml(plain_zones(map_file, clip=False), path, boundary=_boundary(map_file))
+    return write
 
 
 def _isoxml(map_file: MapFile, path: Path, wish: Wish) -> None:
@@ -92,10 +79,6 @@ def _isoxml(map_file: MapFile, path: Path, wish: Wish) -> None:
         bare = replace(map_file, boundary=None)
         written = replace(map_file, zones=tuple(plain_zones(bare, clip=False)), cells=None)
     write_isoxml(replace(written, boundary=_field(map_file)), path)
-
-
-def _boundary(map_file: MapFile) -> MultiPolygon | None:
-    return None if map_file.boundary is None else _sound(map_file.boundary)
 
 
 def _field(map_file: MapFile) -> MultiPolygon | None:
@@ -176,10 +159,11 @@ def _text_map(map_file: MapFile, path: Path, wish: Wish) -> None:
 WRITERS = {
     writer.name: writer
     for writer in (
-        Writer(name="shapefile", suffixes=(".shp", ".zip"), write=_shapefile),
-        Writer(name="geojson", suffixes=(".geojson", ".json"), write=_geojson),
-        Writer(name="geopackage", suffixes=(".gpkg",), write=_geopackage),
-        Writer(name="kml", suffixes=(".kml", ".kmz"), write=_kml),
+        # Beside the zones a zip has the boundary too, but few programs heed it.
+        Writer(name="shapefile", suffixes=(".shp", ".zip"), write=_zones("shapefile", clip=True)),
+        Writer(name="geojson", suffixes=(".geojson", ".json"), write=_zones("geojson")),
+        Writer(name="geopackage", suffixes=(".gpkg",), write=_zones("geopackage")),
+        Writer(name="kml", suffixes=(".kml", ".kmz"), write=_zones("kml")),
         Writer(name="isoxml", suffixes=(".xml", ".zip", ""), write=_isoxml),
         Writer(name="geotiff", suffixes=(".tif", ".tiff"), write=_geotiff),
         Writer(name="dji", suffixes=(".zip", ""), write=_dji),
