@@ -12,7 +12,7 @@ from typer.core import TyperGroup
 from analysis.calibration.identify import STEPS_MIN
 from analysis.calibration.steps import Kind
 from analysis.write_back import Write, check_asked, written_lines
-from companion.cli.answer import AsJson, answer, note
+from companion.cli.answer import AsJson, JournalFile, answer, new_app, note
 from companion.cli.app import load_command
 from companion.commands import Command
 from companion.errors import ConfigError, JournalError, VrsprayError
@@ -50,20 +50,17 @@ class Commands(TyperGroup):
         return load_command(cmd_name, place)
 
 
-app = typer.Typer(
+app = new_app(
     cls=Commands,
     help="Measure a sprayer: lags (from flow or marks), flow curves, each valve, the swath.",
     epilog="Example: vrspray calibrate flow bucket.csv --config config.toml",
     no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
 )
 
 
 @app.command(epilog="Example: vrspray calibrate lag flights/flight-0001.gpkg")
 def lag(
-    journal: Annotated[Path, typer.Argument(help="Journal of a flight, such as flight-0001.gpkg.")],
+    journal: JournalFile,
     meter_lag_s: Annotated[
         float, typer.Option(help="Delay of the meter, including its message, in seconds.")
     ] = 0.001,

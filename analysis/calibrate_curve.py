@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from analysis.calibrate_valves import (
-    ConfigFile,
     HoldLines,
     Keep,
     Measure,
@@ -36,7 +35,7 @@ from analysis.calibration.curve import (
 )
 from analysis.calibration.valves import ValveCourseError
 from analysis.write_back import Write, written_lines
-from companion.cli.answer import AsJson, Overrides, answer
+from companion.cli.answer import AsJson, ConfigFile, Overrides, answer
 from companion.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -11,7 +11,14 @@ import typer
 
 from analysis.bucket import PULSE, PULSE_FULL_US, BucketCurve, Catch, fit_bucket
 from analysis.csv_rows import Row, TableError, column_names, read_rows
-from analysis.write_back import Confirmed, Write, check_asked, check_change, written_lines
+from analysis.write_back import (
+    Confirmed,
+    Write,
+    check_asked,
+    check_change,
+    tell_measured,
+    written_lines,
+)
 from companion.cli.answer import AsJson, answer, note
 
 if TYPE_CHECKING:
@@ -289,10 +296,7 @@ def flow(
 
         plot_flow(curves, plot)
         result["plot"] = str(plot)
-    changed = written_lines(config, result, is_write=is_write)
-    answer(result, [*_lines(result), *changed], as_json=as_json)
-    for warning in result["warnings"]:
-        note(f"warning: {warning}")
+    tell_measured(config, result, _lines(result), is_write=is_write, as_json=as_json)
 
 
 def _known(config: Path | None) -> tuple[tuple[str, ...] | None, tuple[float, float]]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from analysis.write_back import Write, check_asked, written_lines
+from analysis.write_back import Write, check_asked, tell_measured
 from companion.cli.answer import AsJson, answer, note
 
 if TYPE_CHECKING:
@@ -80,10 +80,7 @@ def lag_marks(
 
         plot_marks(marks, fit, plot)
         result["plot"] = str(plot)
-    changed = written_lines(config, result, is_write=is_write)
-    answer(result, [*_lines(result), *changed], as_json=as_json)
-    for warning in result["warnings"]:
-        note(f"warning: {warning}")
+    tell_measured(config, result, _lines(result), is_write=is_write, as_json=as_json)
 
 
 def read_marks(path: Path) -> list[Mark]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from analysis.write_back import Write, check_asked, written_lines
+from analysis.write_back import Write, check_asked, tell_measured
 from companion.cli.answer import AsJson, answer, note
 from companion.wording import counted
 
@@ -82,10 +82,7 @@ def swath(
         answer({**result, "error": text}, (), as_json=as_json)
         note(f"error: {text}")
         raise typer.Exit(1)
-    changed = written_lines(config, result, is_write=is_write)
-    answer(result, [*_lines(result), *changed], as_json=as_json)
-    for warning in result["warnings"]:
-        note(f"warning: {warning}")
+    tell_measured(config, result, _lines(result), is_write=is_write, as_json=as_json)
 
 
 def read_passes(path: Path) -> tuple[Pattern, ...]:

@@ -26,7 +26,7 @@ from analysis.calibration.valves import (
     identify_valves,
 )
 from analysis.write_back import Write, written_lines
-from companion.cli.answer import AsJson, Overrides, answer, note
+from companion.cli.answer import AsJson, ConfigFile, Overrides, answer, note
 from companion.core.inputs import AutopilotLiquid
 from companion.core.schedule import LagModel
 from companion.errors import ConfigError
@@ -41,9 +41,6 @@ if TYPE_CHECKING:
     from companion.sensors import EdgeSource, Meter
 
 # Options of what is measured by pieces of ground work.
-ConfigFile = Annotated[
-    Path, typer.Option("--config", metavar="FILE", help="Configuration, a TOML file.")
-]
 HoldLines = Annotated[
     bool,
     typer.Option("--hold-lines", help="Lines on stdin hold instead of the space bar: for scripts."),

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from companion.cli.answer import AsJson, JournalFile, new_app
 
 if TYPE_CHECKING:
     from analysis.replay import ReplayResult
@@ -17,17 +18,17 @@ ZONES_SHOWN = 10
 # A border that nothing may cross is kept by the first and the last flow of a valve.
 STRICT = {"lag.on_s": "lag.on_start_s", "lag.off_s": "lag.off_end_s"}
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
+app = new_app()
 
 
 @app.command(epilog="Example: vrspray replay flights/flight-0001.gpkg --set lag.up_s=0.12")
 def replay_journal(
-    journal: Annotated[Path, typer.Argument(help="Journal of a flight, such as flight-0001.gpkg.")],
+    journal: JournalFile,
     changes: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Change a setting first, to ask what if."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Replay a flight's recorded inputs and compare every decision.
 

@@ -15,7 +15,7 @@ import shapely
 import typer
 
 from companion.atomic_write import write_atomically
-from companion.cli.answer import AsJson, answer, note
+from companion.cli.answer import AsJson, answer, new_app, note
 from companion.csv_table import csv_of
 from companion.errors import VrsprayError
 from companion.wording import counted, missing
@@ -36,7 +36,7 @@ class TrialError(VrsprayError):
     """A trial or its harvest cannot be read."""
 
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+app = new_app()
 
 
 @app.command(

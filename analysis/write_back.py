@@ -11,7 +11,7 @@ import difflib
 import os
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,6 +20,7 @@ from typing import Annotated, Any
 import typer
 
 from companion.atomic_write import write_atomically
+from companion.cli.answer import answer, note
 from companion.config import load
 from companion.errors import ConfigError
 
@@ -78,6 +79,20 @@ def written_lines(config: Path | None, result: dict[str, Any], *, is_write: bool
         return []
     result["written"] = write_back(config, result["toml"])
     return ["", f"written: {config} (as it was: {config}.bak)", *result["written"]]
+
+
+def tell_measured(
+    config: Path | None,
+    result: dict[str, Any],
+    lines: Iterable[str],
+    *,
+    is_write: bool,
+    as_json: bool,
+) -> None:
+    """Write what was measured, if it is asked for, and print it with what changed and warnings."""
+    answer(result, [*lines, *written_lines(config, result, is_write=is_write)], as_json=as_json)
+    for warning in result["warnings"]:
+        note(f"warning: {warning}")
 
 
 def write_back(config: Path, measured: str) -> list[str]:

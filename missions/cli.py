@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from companion.cli.answer import AsJson, Tell, answer, note, progress
+from companion.cli.answer import AsJson, Tell, answer, new_app, note, progress
 from companion.errors import MapError
 from companion.wording import counted
 from missions.files.fence import Fences, Ground, fence_warnings
@@ -61,7 +61,7 @@ OBJECTS_TO_LOOK = 100_000
 # Below this no bar is worth looking at.
 BAR_AFTER_S = 2.0
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+app = new_app()
 
 
 @app.command(

@@ -8,6 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
+from companion.cli.answer import AsJson, new_app
+
 
 class Board(StrEnum):
     """The driver boards that there are."""
@@ -47,12 +49,10 @@ class Corners(StrEnum):
 
 
 VEHICLE = "drawn, or flown: as in logs of real flights (gusts, turns, position errors)."
-app = typer.Typer(
+app = new_app(
     help="The simulated flight: stub autopilot and twin.",
     epilog="Example: vrspray sitl serve --autopilot px4",
     no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
 )
 
 
@@ -132,7 +132,7 @@ def serve(
     no_script: Annotated[
         bool, typer.Option("--no-script", help="ArduPilot without its watchdog script.")
     ] = False,
-    json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
+    json: AsJson = False,
 ) -> None:
     """Serve a simulated autopilot for `vrspray run` to connect to.
 
@@ -232,7 +232,7 @@ def fly(
     out: Annotated[
         Path | None, typer.Option(help="Folder for truth, result, picture and journal.")
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
+    json: AsJson = False,
 ) -> None:
     """Simulate a mission in closed loop, or fly along a log of your own.
 

@@ -21,7 +21,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from companion.cli.answer import AsJson, answer, note, progress
+from companion.cli.answer import AsJson, answer, new_app, note, progress
 from companion.cli.terminal import terminal, visible
 from companion.errors import ConfigError
 from companion.wording import missing
@@ -57,7 +57,7 @@ class Output(StrEnum):
     SERVO = "servo"
 
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
+app = new_app()
 
 
 @app.command(epilog="Example: vrspray demo --out demo-out --speed 5 --seed 2")

@@ -15,7 +15,7 @@ from typing import Annotated
 
 import typer
 
-from companion.cli.answer import AsJson, answer
+from companion.cli.answer import AsJson, answer, new_app
 from companion.errors import ConfigError
 
 DEPLOY = "deploy"
@@ -37,12 +37,10 @@ ABOUT = {
 # Of a file in another example: `file = "../anyang/prescription.shp"`.
 _BESIDE = re.compile(r'"\.\./([\w-]+)/')
 
-app = typer.Typer(
+app = new_app(
     help="List the examples of this installation, or copy one.",
     epilog="Example: vrspray examples copy anyang --to field",
     no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode=None,
 )
 
 

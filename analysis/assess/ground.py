@@ -20,6 +20,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from analysis.changes import ground_rates
+from analysis.flown.modelled_flow import ordered_s
 from companion.core.boom import Valve
 from companion.core.frame import LocalFrame
 
@@ -105,7 +106,7 @@ def open_spans(flight: AppliedFlight, valve: int) -> Iterator[tuple[float, float
     """Yield from when to when a valve sprayed: its executed changes, later by their lags."""
     lag, changes = flight.setup.lag, flight.changes
     mine = changes.valve == valve
-    at_s = np.where(np.isfinite(changes.actual_s), changes.actual_s, changes.planned_s)[mine]
+    at_s = ordered_s(changes)[mine]
     edges = np.flatnonzero(np.diff(changes.duty[mine] > 0.0, prepend=False))
     opens_s = (at_s[edges[::2]] + lag.on_s + lag.output_s).tolist()
     closes_s = (at_s[edges[1::2]] + lag.off_s + lag.output_s).tolist()

@@ -12,7 +12,7 @@ import typer
 
 from analysis.exports.output import ExportError
 from analysis.exports.source import Shape
-from companion.cli.answer import AsJson, answer, note
+from companion.cli.answer import AsJson, JournalFiles, answer, new_app, note
 
 if TYPE_CHECKING:
     from analysis.exports.columns import System
@@ -141,18 +141,13 @@ def _ends() -> list[str]:
 
 # -------------------------------------------------------------------------------------- the command
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
+app = new_app()
 RATE_HZ_MAX = 1000.0
 
 
 @app.command(epilog="Example: vrspray export flights/flight-0001.gpkg --out flight-0001.geojson")
 def export_journal(
-    journals: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="JOURNAL...", help="Journal of a flight; of a job, those of all its sorties."
-        ),
-    ],
+    journals: JournalFiles,
     out: Annotated[Path, typer.Option(help="File to write; the suffix sets the format.")],
     name: Annotated[
         str | None,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from companion.cli.answer import AsJson, answer, note, progress
+from companion.cli.answer import AsJson, answer, new_app, note, progress
 from companion.wording import counted
 
 if TYPE_CHECKING:
@@ -19,9 +19,7 @@ SHOWN_MAX = 20
 # Below this nothing is to be seen.
 PROGRESS_AFTER_S = 2.0
 
-app = typer.Typer(
-    add_completion=False,
-    rich_markup_mode=None,
+app = new_app(
     no_args_is_help=True,
     help="Many journals as one data set: add, query with SQL, report, serve.",
     epilog="Example: vrspray fleet add flights --into fleet",

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from analysis.flight_record import Spans, joined
 from analysis.flown.applied_flight import Floats, Ints, ValveChanges
+from analysis.flown.modelled_flow import ordered_s
 
 UNREAD = "unread"
 # `applied` has ten rows a second; a journal has at least ten entries a second, mostly fifty. Fewer
@@ -94,7 +95,7 @@ def doubtful_holes(changes: ValveChanges, time_s: Floats, flow_l_min: Floats) ->
 
     And from the last change on, where valves stay open and the flow of the samples still varies.
     """
-    at_s = _order_s(changes)
+    at_s = ordered_s(changes)
     if not len(at_s):
         flowing = time_s[flow_l_min > 0.0]
         return [Hole(-_INF, _INF, 0)] if len(flowing) and np.ptp(flowing) > DIFFERENT_S else []
@@ -141,7 +142,7 @@ def within(time_s: Floats, holes: Sequence[Hole]) -> NDArray[np.bool_]:
 
 
 def _closed(changes: ValveChanges, hole: Hole, *, is_known_after: bool) -> ValveChanges:
-    at_s = _order_s(changes)
+    at_s = ordered_s(changes)
     before = at_s <= hole.from_s
     after = (at_s >= hole.until_s) & ~before
     added: list[tuple[float, int, float]] = []
@@ -170,10 +171,6 @@ def _closed(changes: ValveChanges, hole: Hole, *, is_known_after: bool) -> Valve
 def _duties(changes: ValveChanges, its: NDArray[np.bool_]) -> dict[int, float]:
     """Return the last duty of each valve."""
     return dict(zip(changes.valve[its].tolist(), changes.duty[its].tolist(), strict=True))
-
-
-def _order_s(changes: ValveChanges) -> Floats:
-    return np.where(np.isfinite(changes.actual_s), changes.actual_s, changes.planned_s)
 
 
 def _open_counts(changes: ValveChanges) -> Ints:
@@ -220,7 +217,7 @@ def unknown_times(
     """
     if not samples and not missing:
         return ()
-    at_s = np.where(np.isfinite(changes.actual_s), changes.actual_s, changes.planned_s)
+    at_s = ordered_s(changes)
     found = []
     for valve in range(valves):
         own_s = np.sort(at_s[changes.valve == valve])

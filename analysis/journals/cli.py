@@ -16,7 +16,7 @@ from analysis.journals.content import read_entries
 from analysis.journals.jobs import joined, one_job
 from analysis.journals.remaining import remaining
 from analysis.journals.salvage import recover_folder
-from companion.cli.answer import AsJson, answer
+from companion.cli.answer import AsJson, answer, new_app
 from companion.cli.flights import FAILED, ConfigFile, Folder, as_object, line_of, place_of
 from companion.errors import JournalError, UnreadableError
 from companion.journal.folder import look_at
@@ -182,9 +182,7 @@ def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:g}"
 
 
-SHOW, REMAINING, RECOVER, JOB = (
-    typer.Typer(add_completion=False, rich_markup_mode=None) for _ in range(4)
-)
+SHOW, REMAINING, RECOVER, JOB = (new_app() for _ in range(4))
 REMAINING.command(
     epilog="Example: vrspray flights remaining flights/flight-0001.gpkg --out rest.geojson"
 )(remaining)

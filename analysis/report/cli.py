@@ -9,9 +9,9 @@ from typing import Annotated
 
 import typer
 
-from companion.cli.answer import AsJson, answer, note
+from companion.cli.answer import AsJson, JournalFiles, answer, new_app, note
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
+app = new_app()
 
 
 class Law(StrEnum):
@@ -25,12 +25,7 @@ class Law(StrEnum):
 
 @app.command(epilog="Example: vrspray report flights/flight-0001.gpkg --out report --profile eu")
 def report_flight(
-    journals: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="JOURNAL...", help="Journal of a flight; of a job, those of all its sorties."
-        ),
-    ],
+    journals: JournalFiles,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the files of the report.")],
     profile: Annotated[
         list[Law] | None,

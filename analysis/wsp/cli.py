@@ -43,7 +43,7 @@ from analysis.wsp.results import (
 )
 from analysis.wsp.stains import SPREADS, THRESHOLD, Threshold, spread_of
 from companion.atomic_write import write_atomically
-from companion.cli.answer import AsJson, answer, note
+from companion.cli.answer import AsJson, answer, new_app, note
 from companion.errors import ConfigError, JournalError
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 FIGURE = "distributions.png"
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+app = new_app()
 
 
 @app.command(epilog="Example: vrspray wsp scan.png --out paper --spread usda")

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from functools import wraps
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
@@ -29,6 +30,25 @@ Overrides = Annotated[
 ]
 
 
+ConfigFile = Annotated[
+    Path, typer.Option("--config", metavar="FILE", help="Configuration, a TOML file.")
+]
+JournalFile = Annotated[Path, typer.Argument(help="Journal of a flight, such as flight-0001.gpkg.")]
+JournalFiles = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="JOURNAL...", help="Journal of a flight; of a job, those of all its sorties."
+    ),
+]
+
+
+def new_app(**more: Any) -> typer.Typer:
+    """Return what takes commands that look and fail as all others do."""
+    return typer.Typer(
+        add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False, **more
+    )
+
+
 def answer(result: Mapping[str, Any], lines: Iterable[str], *, as_json: bool) -> None:
     """Print the result on stdout: one JSON object, or lines for a person."""
     if as_json:
@@ -36,6 +56,12 @@ def answer(result: Mapping[str, Any], lines: Iterable[str], *, as_json: bool) ->
         return
     for line in lines:
         typer.echo(_one(line), file=terminal(sys.stdout) if isinstance(line, Styled) else None)
+
+
+def note_problems(result: Mapping[str, Any]) -> None:
+    """Print the problems of a result on stderr."""
+    for problem in result["problems"]:
+        note(problem_line(problem))
 
 
 def note(line: str) -> None:

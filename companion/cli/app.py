@@ -26,6 +26,7 @@ import typer
 from typer._click.exceptions import NoArgsIsHelpError
 from typer.core import TyperArgument, TyperCommand, TyperGroup, TyperOption
 
+from companion.cli.answer import new_app
 from companion.cli.beside import give_way
 from companion.cli.terminal import shown_as_text
 from companion.commands import Command, Haste, all_registered, command_named, load, registered
@@ -147,7 +148,7 @@ def load_command(name: str, command: Command) -> ClickCommand:
         and not isinstance(found, typer.Typer)
         and not hasattr(found, "make_context")
     ):
-        function, found = found, typer.Typer(add_completion=False, rich_markup_mode=None)
+        function, found = found, new_app()
         found.command()(function)
     command_itself = typer.main.get_command(found) if isinstance(found, typer.Typer) else found
     return _in_our_style(command_itself)

@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from companion.assembly import build_setup, deliverable, flight_map_of
-from companion.cli.answer import AsJson, Overrides, answer, note, problem_line, problem_object
+from companion.cli.answer import (
+    AsJson,
+    Overrides,
+    answer,
+    new_app,
+    note,
+    problem_line,
+    problem_object,
+)
 from companion.cli.app import refusal
 from companion.config import Config, load
 from companion.config.rules import mismatches, remarks, without_effect
@@ -21,9 +29,7 @@ from companion.wording import show_value
 if TYPE_CHECKING:
     from companion.cli.new_config import Answers
 
-app = typer.Typer(
-    add_completion=False,
-    rich_markup_mode=None,
+app = new_app(
     help="Check or show a configuration, or print its schema.",
     epilog="Example: vrspray config check examples/anyang/config.toml",
 )

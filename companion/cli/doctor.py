@@ -8,13 +8,12 @@ import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, date, datetime
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from companion.assembly import build_setup, deliverable, flight_map_of
-from companion.cli.answer import AsJson, Overrides, answer
+from companion.cli.answer import AsJson, ConfigFile, Overrides, answer, new_app
 from companion.cli.doctor_click import guided_click
 from companion.cli.doctor_watchdogs import watchdog_checks
 from companion.cli.output_parts import build_link, engine_setup, load_with_kept, servo_options
@@ -65,14 +64,12 @@ from companion.output.autopilot_guard import REFUSALS, Finding, findings, px4_wi
 from companion.output.autopilot_options import TOLERANCE_US, ServoOptions
 from companion.wording import counted
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
+app = new_app()
 
 
 @app.command(epilog="Example: vrspray doctor --config examples/anyang/config.toml --no-link")
 def doctor(
-    config_file: Annotated[
-        Path, typer.Option("--config", metavar="FILE", help="Configuration, a TOML file.")
-    ],
+    config_file: ConfigFile,
     no_vehicle: Annotated[
         bool, typer.Option("--no-link", help="Skip the checks that need the vehicle.")
     ] = False,

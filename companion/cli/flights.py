@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from companion.cli.answer import AsJson, answer, note
+from companion.cli.answer import AsJson, answer, new_app, note
 from companion.cli.app import load_command
 from companion.cli.record_parts import rules_of
 from companion.commands import all_registered, command_named, registered
@@ -49,10 +49,8 @@ class FlightsTable(TyperGroup):
             formatter.write_dl(rows)
 
 
-app = typer.Typer(
+app = new_app(
     cls=FlightsTable,
-    add_completion=False,
-    rich_markup_mode=None,
     help="Journals of flights: list, show, job, remaining, pin, unpin, prune, recover.",
     epilog="Example: vrspray flights list --folder flights",
 )

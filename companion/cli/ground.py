@@ -26,7 +26,17 @@ from typing import Annotated, Any
 import typer
 
 from companion import runtime
-from companion.cli.answer import REQUIRED, AsJson, Option, Overrides, answer, note, with_options
+from companion.cli.answer import (
+    REQUIRED,
+    AsJson,
+    ConfigFile,
+    Option,
+    Overrides,
+    answer,
+    new_app,
+    note,
+    with_options,
+)
 from companion.cli.beside import shown
 from companion.cli.ground_tasks import (
     GroundOptionError,
@@ -177,9 +187,6 @@ def read_line(descriptor: int) -> str | None:
     return line.decode(errors="replace").strip() if line else None
 
 
-_ConfigFile = Annotated[
-    Path, typer.Option("--config", metavar="FILE", help="Configuration, a TOML file.")
-]
 _Lines = Annotated[
     bool,
     typer.Option("--hold-lines", help="Lines on stdin hold instead of the space bar: for scripts."),
@@ -215,7 +222,7 @@ def _asked(
 asked_options = with_options(
     "asked",
     {
-        "config_file": Option(_ConfigFile, REQUIRED),
+        "config_file": Option(ConfigFile, REQUIRED),
         "is_lines": Option(_Lines, False),
         "overrides": Option(Overrides),
         "as_json": Option(AsJson, False),
@@ -435,9 +442,7 @@ def in_words(reasons: Iterable[str], fault: str = "") -> str:
 
 # ------------------------------------------------------------------------------------- the commands
 
-app = typer.Typer(
-    add_completion=False,
-    rich_markup_mode=None,
+app = new_app(
     help="Open valves on the ground, with the vehicle disarmed, while you hold a key.",
     epilog="Example: vrspray ground prime --config config.toml",
 )

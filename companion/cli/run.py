@@ -16,7 +16,7 @@ import typer
 
 from companion import runtime
 from companion.assembly import build_setup, deliverable, flight_map_of, refuse_mismatch
-from companion.cli.answer import AsJson, Overrides, answer, note
+from companion.cli.answer import AsJson, ConfigFile, Overrides, answer, new_app, note
 from companion.cli.beside import shown
 from companion.cli.live import Screen, Watcher
 from companion.cli.output_parts import (
@@ -45,14 +45,12 @@ if TYPE_CHECKING:
 # By these systemd, or a container, asks to be told of the steps.
 _NOTIFY = frozenset({"NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID", "VRSPRAY_ALIVE_FILE"})
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
+app = new_app()
 
 
 @app.command(epilog="Example: vrspray run --config examples/anyang/config.toml")
 def run_companion(
-    config_file: Annotated[
-        Path, typer.Option("--config", metavar="FILE", help="Configuration, a TOML file.")
-    ],
+    config_file: ConfigFile,
     duration_s: Annotated[
         float | None, typer.Option(min=0.0, max=1e7, help="Stop after this time.")
     ] = None,

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
-from companion.cli.answer import AsJson, answer
+from companion.cli.answer import AsJson, answer, new_app
 from companion.cli.output_parts import (
     engine_setup,
     motor_closer_arguments,
@@ -38,9 +38,7 @@ DEFAULT_CONFIG = Path("/etc/vrspray/config.toml")
 # Who may open serial devices and lines; those that this computer does not have are left out.
 _GROUPS = ("dialout", "gpio", "spi")
 
-app = typer.Typer(
-    add_completion=False,
-    rich_markup_mode=None,
+app = new_app(
     help="Install, remove or show the systemd service.",
     epilog="Example: sudo vrspray service install --config /etc/vrspray/config.toml",
 )

@@ -17,7 +17,7 @@ from typing import Annotated, Any
 
 import typer
 
-from companion.cli.answer import AsJson, answer, note
+from companion.cli.answer import AsJson, answer, new_app, note
 from companion.cli.drawing import drawn
 from companion.cli.live import DRAWN_EVERY_S, PLAIN_EVERY_S, Shown
 from companion.cli.terminal import terminal
@@ -137,7 +137,7 @@ _TAKEN = (
 )
 _TRAINING = {1.0: "water", 2.0: "dry", 3.0: "ground"}
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
+app = new_app()
 
 
 @app.command(epilog="Example: vrspray top --link udpin:127.0.0.1:14551")

@@ -12,11 +12,9 @@ from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
-
-from companion.cli.answer import AsJson, Overrides, answer, note
+from companion.cli.answer import AsJson, ConfigFile, Overrides, answer, new_app, note
 from companion.cli.field_choice import CHOSEN_NAME, FieldChoice, no_choice, read_choice
 from companion.config import Config, load
 from companion.config.legal_entries import check
@@ -368,15 +366,10 @@ def watched(page: OperatorPage, journal: Journal, link: VehicleLink) -> Recorder
 
 # ---------------------------------------------------------------------------------- `vrspray token`
 
-app = typer.Typer(
-    add_completion=False,
-    rich_markup_mode=None,
+app = new_app(
     help="Links of the operator's page: show, rotate.",
     epilog="Example: vrspray token show --config /etc/vrspray/config.toml",
 )
-ConfigFile = Annotated[
-    Path, typer.Option("--config", metavar="FILE", help="Configuration, a TOML file.")
-]
 
 
 @app.command(epilog="Example: vrspray token show --config config.toml")

@@ -16,8 +16,8 @@ from companion.cli.answer import (
     AsJson,
     Overrides,
     answer,
-    note,
-    problem_line,
+    new_app,
+    note_problems,
     problem_object,
     progress,
 )
@@ -66,8 +66,7 @@ from missions.make.zones import Limits, Made, Wish, cells, make_zones, polygons
 from missions.maps.convert.formats import writer_for
 from missions.maps.model import MapFile, check_folder, digest, map_error, read_bytes
 
-app = typer.Typer(
-    add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False,
+app = new_app(
     no_args_is_help=True, help="Make prescriptions from a field's data.",
     epilog="Example: vrspray make zones ndvi.tif --value NDVI --out field.gpkg",
 )  # fmt: skip
@@ -235,8 +234,7 @@ def zones(
     if png is not None:
         draw_picture(map_file, png, title=out.name)
     result = _result(made, read, field, limits, missing, problems, files)
-    for problem in result["problems"]:
-        note(problem_line(problem))
+    note_problems(result)
     answer(result, _lines(result, made, read), as_json=as_json)
     raise typer.Exit(0 if result["ok"] else 1)
 

@@ -19,7 +19,7 @@ from companion.cli.answer import (
     Overrides,
     answer,
     note,
-    problem_line,
+    note_problems,
     problem_object,
     progress,
 )
@@ -240,8 +240,7 @@ def spots(
     }  # fmt: skip
     for warning in result["warnings"]:
         note(f"warning: {warning}")
-    for problem in result["problems"]:
-        note(problem_line(problem))
+    note_problems(result)
     answer(result, _lines(result), as_json=as_json)
     raise typer.Exit(0 if result["ok"] else 1)
 

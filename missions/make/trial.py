@@ -19,7 +19,13 @@ from shapely import Polygon
 from shapely.geometry.base import BaseGeometry
 
 from companion.atomic_write import write_atomically
-from companion.cli.answer import AsJson, Overrides, answer, note, problem_line, problem_object
+from companion.cli.answer import (
+    AsJson,
+    Overrides,
+    answer,
+    note_problems,
+    problem_object,
+)
 from companion.config import load
 from companion.map_formats import geojson_feature, geojson_text
 from companion.wording import counted
@@ -311,8 +317,7 @@ def trial(
             for plot in plots
         ],
     }
-    for problem in result["problems"]:
-        note(problem_line(problem))
+    note_problems(result)
     answer(result, _lines(result, plots, design), as_json=as_json)
     raise typer.Exit(0 if ok else 1)
 

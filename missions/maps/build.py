@@ -118,7 +118,7 @@ def _policy(map_file: MapFile, overlap: str) -> Overlap:
 
 def _zones(map_file: MapFile, frame: LocalFrame) -> list[Zone]:
     """Return all zones that have a rate, in metres."""
-    rated = [zone for zone in map_file.zones if zone.rate_l_ha is not None]
+    rated = map_file.rated
     if not rated:
         return []
     degrees = np.array([zone.geometry for zone in rated], dtype=object)

@@ -123,6 +123,11 @@ class MapFile:
             raise ValueError("a map has zones or cells, not both")
 
     @property
+    def rated(self) -> list[MapZone]:
+        """Return the zones that have a rate."""
+        return [zone for zone in self.zones if zone.rate_l_ha is not None]
+
+    @property
     def rates_l_ha(self) -> tuple[float, ...]:
         """Return the different rates in the file, the least first."""
         if self.cells is not None:

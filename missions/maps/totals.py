@@ -162,7 +162,7 @@ def _of_zones(
     map_file: MapFile, ground: Ground, overlap: str, frame: LocalFrame, areas_m2: Floats | None
 ) -> tuple[Floats, Floats]:
     """Return rates and areas [m2] of the zones that have a rate."""
-    rated = [zone for zone in map_file.zones if zone.rate_l_ha is not None]
+    rated = map_file.rated
     rates = np.array([zone.rate_l_ha for zone in rated], dtype=np.float64)
     if areas_m2 is not None and overlap == "error":
         return rates, areas_m2[[zone.rate_l_ha is not None for zone in map_file.zones]]
@@ -208,5 +208,5 @@ def _by_policy(local: Objects, rates: Floats, overlap: str) -> tuple[Floats, Flo
 
 def _covered_m2(map_file: MapFile, ground: Ground, frame: LocalFrame) -> float:
     """Return the ground under any zone with a rate, so that the default falls on the rest."""
-    rated = [zone for zone in map_file.zones if zone.rate_l_ha is not None]
+    rated = map_file.rated
     return float(shapely.union_all(_cut(rated, ground, frame)).area)

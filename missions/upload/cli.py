@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
-from companion.cli.answer import AsJson, answer, note
+from companion.cli.answer import AsJson, answer, new_app, note
 from companion.config import load
 from companion.wording import counted
 from missions.errors import UploadError
@@ -40,7 +40,7 @@ from missions.upload.transfer import (
 WAIT_S = 15.0
 FAILED = 1
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+app = new_app()
 
 
 @app.command(epilog="Example: vrspray upload field.plan --link udpin:0.0.0.0:14550")

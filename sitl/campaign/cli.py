@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer.core import TyperGroup
 
-from companion.cli.answer import AsJson, answer, note, progress
+from companion.cli.answer import AsJson, answer, new_app, note, progress
 from companion.errors import ConfigError, StoppedError
 from companion.wording import counted
 
@@ -40,14 +40,11 @@ class RunIsUnsaid(TyperGroup):
         return super().parse_args(ctx, args)
 
 
-app = typer.Typer(
+app = new_app(
     cls=RunIsUnsaid,
     help="Simulate many flights, varying settings: vrspray campaign FILE. Show the results.",
     epilog="Example: vrspray campaign lags.toml --out lags && vrspray campaign show lags",
     no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
 )
 
 

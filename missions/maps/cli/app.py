@@ -15,7 +15,14 @@ from typing import Annotated, Any
 
 import typer
 
-from companion.cli.answer import AsJson, Overrides, answer, problem_line, problem_object
+from companion.cli.answer import (
+    AsJson,
+    Overrides,
+    answer,
+    new_app,
+    problem_line,
+    problem_object,
+)
 from companion.config import Config, load
 from companion.config.tables import PrescriptionTable
 from companion.core.frame import LocalFrame
@@ -226,9 +233,7 @@ def offset_between(in_map: Place, surveyed: Place) -> tuple[float, float]:
 
 POINTS_MAX = 1_000_000
 
-app = typer.Typer(
-    add_completion=False,
-    rich_markup_mode=None,
+app = new_app(
     help="Check, show, convert, compile and make prescription maps.",
     epilog="Example: vrspray map check examples/anyang/prescription.shp",
 )

@@ -10,7 +10,13 @@ import numpy as np
 import typer
 from shapely import MultiPolygon
 
-from companion.cli.answer import AsJson, answer, note, problem_line, problem_object
+from companion.cli.answer import (
+    AsJson,
+    answer,
+    note,
+    note_problems,
+    problem_object,
+)
 from companion.errors import MapError
 from missions.maps.cli.options import File, Reading, reading_options
 from missions.maps.convert.cell_zones import outline_of_rates
@@ -115,8 +121,7 @@ def convert(
         note(f"error: {error}")
         raise typer.Exit(1) from None
     result = _result(file, out, files, writer.name, source, checked[0])
-    for problem in result["problems"]:
-        note(problem_line(problem))
+    note_problems(result)
     answer(result, _lines(result), as_json=as_json)
 
 
@@ -352,8 +357,7 @@ def show(file: File, reading: Reading, out: _Picture, as_json: AsJson = False) -
         "litres": drawn.all_litres,
         "problems": [problem_object(problem) for problem in source.problems],
     }
-    for problem in result["problems"]:
-        note(problem_line(problem))
+    note_problems(result)
     answer(
         result,
         [

@@ -274,7 +274,7 @@ def outline_of_rates(map_file: MapFile) -> MultiPolygon:
     """Return the ground of all that has a rate, for a format that wants an outline of the field."""
     cells = map_file.cells
     if cells is None:
-        grounds = [zone.geometry for zone in map_file.zones if zone.rate_l_ha is not None]
+        grounds = [zone.geometry for zone in map_file.rated]
     else:
         rated = np.where(np.isnan(cells.rates_l_ha), np.nan, 0.0)
         grounds = [zone.geometry for zone in zones_of(replace(cells, rates_l_ha=rated))]

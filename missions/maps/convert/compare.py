@@ -152,7 +152,7 @@ def rates_at(
 
 
 def _zone_rates(map_file: MapFile, longitude: Floats, latitude: Floats, overlap: str) -> Floats:
-    rated = [zone for zone in map_file.zones if zone.rate_l_ha is not None]
+    rated = map_file.rated
     rates = np.full(len(longitude), np.nan)
     if not rated:
         return rates
@@ -250,7 +250,7 @@ def _on_zones(
     map_file: MapFile, frame: LocalFrame, drawn: int, random: np.random.Generator
 ) -> tuple[Floats, Floats]:
     """Return places in the boxes of the parts of zones, more in the larger ones."""
-    rated = [zone.geometry for zone in map_file.zones if zone.rate_l_ha is not None]
+    rated = [zone.geometry for zone in map_file.rated]
     parts = shapely.get_parts(project_all(np.array(rated, dtype=object), frame))
     if not len(parts):
         return np.zeros(drawn), np.zeros(drawn)

@@ -149,7 +149,7 @@ def _reaching(cells: MapCells, boundary: MultiPolygon, path: Path) -> MapCells:
 
 def _bounds(map_file: MapFile) -> Box:
     """Return west, south, east, north of all that gets a rate."""
-    grounds = [zone.geometry for zone in map_file.zones if zone.rate_l_ha is not None]
+    grounds = [zone.geometry for zone in map_file.rated]
     if map_file.boundary is not None and map_file.default_rate_l_ha is not None:
         grounds.append(map_file.boundary)
     boxes = [shapely.total_bounds(np.array(grounds, dtype=object)).tolist()] if grounds else []
@@ -184,7 +184,7 @@ def _lattice(box: Box, cell_m: float, path: Path) -> tuple[tuple[int, int], Affi
 
 
 def _of_zones(map_file: MapFile, shape: tuple[int, int], transform: Affine, overlap: str) -> Floats:
-    zones = [zone for zone in map_file.zones if zone.rate_l_ha is not None]
+    zones = map_file.rated
     if overlap == "error":
         _refuse_overlaps(map_file, zones)
     a, _, c, _, e, f = transform

@@ -10,6 +10,7 @@ import shapely
 from shapely import Geometry, Polygon
 from shapely.errors import ShapelyError
 
+from companion.cli.answer import problem_object
 from companion.core.frame import WGS84
 from missions.maps.cells import shares_inside, to_degrees
 from missions.maps.lint.survey import Survey, area_text, latitude_longitude
@@ -72,16 +73,7 @@ def summary(
         "rates_l_ha": list(map_file.rates_l_ha),
         "bounds": list(survey.bounds_deg),
         "sha256": map_file.sha256,
-        "problems": [
-            {
-                "severity": problem.severity,
-                "code": problem.code,
-                "text": problem.text,
-                "where": problem.where,
-                "fix": problem.fix,
-            }
-            for problem in problems
-        ],
+        "problems": [problem_object(problem) for problem in problems],
     }
 
 
