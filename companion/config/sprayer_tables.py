@@ -272,7 +272,14 @@ Speeds = Annotated[
     Field(strict=False, min_length=2, max_length=1000),
 ]
 Diameter = Annotated[FiniteFloat, Field(ge=5, le=5000)]
-MotorOutput = Literal["autopilot", "pwm"]
+MotorOutput = Annotated[
+    Literal["autopilot", "pwm"], Field(description="pwm: hardware PWM of this computer")
+]
+MotorChannel = Annotated[
+    int, Field(ge=0, le=32, description="servo output or actuator, or the PWM's number")
+]
+MotorChip = Annotated[int, Field(ge=0, le=99, description="pwm only: number of the pwmchip")]
+StopPulse = Annotated[Pulse, Field(description="servo pulse that stops it")]
 
 
 class PumpTable(Table):
@@ -281,12 +288,10 @@ class PumpTable(Table):
     control: Literal["modulates", "constant"] = Field(
         description="modulates: its speed makes the flow; constant: it supplies PWM valves"
     )
-    output: MotorOutput = Field(
-        default="autopilot", description="pwm: hardware PWM of this computer"
-    )
-    channel: int = Field(ge=0, le=32, description="servo output or actuator, or the PWM's number")
-    chip: int = Field(default=0, ge=0, le=99, description="pwm only: number of the pwmchip")
-    stop_us: Pulse = Field(default=1000, description="servo pulse that stops it")
+    output: MotorOutput = "autopilot"
+    channel: MotorChannel
+    chip: MotorChip = 0
+    stop_us: StopPulse = 1000
     max_us: Pulse = Field(default=2000, description="largest servo pulse")
     min_us: Pulse | None = Field(
         default=None, description="smallest pulse at which it runs evenly; else the curve's first"
@@ -319,12 +324,10 @@ class AtomiserTable(Table):
     """One rotary atomiser."""
 
     name: Text = Field(description="for messages")
-    output: MotorOutput = Field(
-        default="autopilot", description="pwm: hardware PWM of this computer"
-    )
-    channel: int = Field(ge=0, le=32, description="servo output or actuator, or the PWM's number")
-    chip: int = Field(default=0, ge=0, le=99, description="pwm only: number of the pwmchip")
-    stop_us: Pulse = Field(default=1000, description="servo pulse that stops it")
+    output: MotorOutput = "autopilot"
+    channel: MotorChannel
+    chip: MotorChip = 0
+    stop_us: StopPulse = 1000
     us: Pulses = Field(description="measured: pulses, increasing")
     rpm: Speeds = Field(description="measured: speed with liquid at these pulses, increasing")
     droplet_um: Diameter | None = Field(
