@@ -25,9 +25,10 @@ from analysis.report.build import (
     volumes,
     with_files,
 )
-from analysis.report.contents import Caution, finite, record_warnings, verdict_of
+from analysis.report.contents import Caution, record_warnings, verdict_of
 from analysis.report.legal import legal_record
 from analysis.report.legal_fields import Facts, Told
+from companion.cli.answer import finite
 from companion.errors import ConfigError
 from companion.simulated import SIMULATED
 
