@@ -194,8 +194,12 @@ def plan(
     choices_too: Annotated[
         bool,
         typer.Option(
-            "--choices", help="Small fields: show what --leave-max and --overlap-max would change."
+            "--choices", help="Show what --stripes, --leave-max and --overlap-max would change."
         ),
+    ] = False,
+    stripes: Annotated[
+        bool,
+        typer.Option("--stripes", help="Sorties may be stripes, not blocks, to save time."),
     ] = False,
     aircraft: Annotated[
         int | None,
@@ -272,6 +276,7 @@ def plan(
         "leave_max_percent": leave_max,
         "overlap_max_percent": overlap_max,
         "ferry_height_m": ferry_height_m,
+        "stripes": stripes,
     }
     if sprayer and ends_over:
         raise typer.BadParameter("--ends-over needs valves that close one by one, not --sprayer")

@@ -42,6 +42,7 @@ class Settings:
     Valves close where `switch_off_percent` of their strip is treated, if they do. With `ends_over`
     an end of the boom may be beyond the border, where its valves are closed.
     `in_tank_l` is the mix that is in the first aircraft's tank before its first sortie.
+    Sorties are blocks from side to side; as `stripes` they may lie in between each other.
     Without them, `jerk_m_s3` and `return_height_m` are those that the autopilot comes with.
     """
 
@@ -75,6 +76,7 @@ class Settings:
     switch_off_percent: float | None = None
     ends_over: bool = False
     in_tank_l: float = 0.0
+    stripes: bool = False
 
     def __post_init__(self) -> None:
         for name in ("swath_width_m", "speed_m_s", "height_m", "acceleration_m_s2", "tank_l"):

@@ -1,4 +1,4 @@
-"""What a choice between coverage, overlap and time costs on a small field, beside the plan."""
+"""What choices between coverage, overlap, order and time cost, beside the plan."""
 
 from __future__ import annotations
 
@@ -38,13 +38,15 @@ def prices(
     plan: Plan, rates: Rates, *, depots: tuple[tuple[float, float], ...],
     around: Surroundings = NOTHING_AROUND,
 ) -> Iterator[tuple[Price, str]]:  # fmt: skip
-    """Yield the other choices with what they change, in words; none for large fields."""
+    """Yield the other choices with what they change, in words; for large fields, of the order."""
     settings = plan.settings
-    if not is_small(plan.field, settings) or settings.aircraft > 1:
-        return
     now = _price("", plan)
     closes = plan.field.closes is not None and settings.border_buffer_m is not None
-    for option, other in _choices(settings, now, closes=closes):
+    choices = [*_choices(settings, now, closes=closes)] if _is_choice_of_lines(plan) else []
+    if len(plan.sorties) > 1:
+        how = "without" if settings.stripes else "with"
+        choices.append((f"{how} --stripes", replace(settings, stripes=not settings.stripes)))
+    for option, other in choices:
         try:
             there = plan_mission(plan.field, other, rates, depots=depots, around=around)
         except PlanError:
@@ -55,10 +57,14 @@ def prices(
             yield price, _words(price, now)
 
 
+def _is_choice_of_lines(plan: Plan) -> bool:
+    return is_small(plan.field, plan.settings) and plan.settings.aircraft == 1
+
+
 def no_choices(plan: Plan) -> str:
     """Return why there is no other choice to show."""
-    if not is_small(plan.field, plan.settings) or plan.settings.aircraft > 1:
-        return "none: --choices is for small fields and one aircraft"
+    if not _is_choice_of_lines(plan) and len(plan.sorties) < 2:
+        return "none: --choices is for several sorties, or small fields and one aircraft"
     return f"none: no option saves {LEAST_S:g} s of flight or {LEAST_L_PERCENT:g} % of the litres"
 
 

@@ -9,10 +9,12 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
 from itertools import chain, pairwise
 
 import numpy as np
 
+from missions.blocks import Blocks
 from missions.corners import NOSE_DEG, Motion
 from missions.demand import Demand
 from missions.passes import TOUCH_M, Part, Passes, Place, Times, joined_parts, turned
@@ -247,12 +249,15 @@ def several(
     before: Sequence[list[Part]] = (),
     moves: int,
     seed: int,
+    blocks: Blocks | None = None,
 ) -> list[Sorties]:
     """Return sorties that fly the parts: the best ones, and plain ones that take hardly longer.
 
     `known` are sorties that were made elsewhere; all are timed as they are flown in the end. With
-    `before`, sorties for which the battery did not last, the search goes on from these.
+    `before`, sorties for which the battery did not last, the search goes on from these. With
+    `blocks` they are these, as far as it costs no more than they are worth.
     """
+    cost = partial(_cost_s, passes, limits, blocks)
     plain = plainly(passes, limits, planned)
     found = [each for each in (plain, *known) if each]
     course = main_course(passes.lines)
@@ -268,9 +273,11 @@ def several(
         halves = split(passes, limits, run)
         if halves is not None:
             found.append(halves[1])
+    if is_ragged and blocks is not None and not before:
+        found += _as_blocks(passes, limits, planned, blocks)
     if not found:
         return []
-    costs = [sum(flown_by(passes, limits, each).seconds for each in some) for some in found]
+    costs = [sum(map(cost, some)) for some in found]
     best = found[costs.index(min(costs))]
     if is_ragged:
         return (
@@ -280,11 +287,49 @@ def several(
         )
     parts = max(sum(len(sortie) for sortie in best) / len(best), PARTS_MIN)
     trials = min(int(moves / (MOVES_A_PART * parts)), TRIALS_A_SORTIE * len(best))
-    better = regrouped(passes, limits, best, course, trials=trials, seed=seed)
+    better = regrouped(passes, limits, best, course, trials=trials, seed=seed, blocks=blocks)
     # What takes clearly longer by the search's model is not drawn and timed as it is flown.
-    longest_s = CLEARLY * sum(flown_by(passes, limits, each).seconds for each in better)
+    longest_s = CLEARLY * sum(map(cost, better))
     is_near = plain is not None and costs[0] <= longest_s
     return [better, plain] if plain and is_near else [better]
+
+
+def _as_blocks(
+    passes: Passes, limits: Limits, planned: Sequence[Part], blocks: Blocks
+) -> list[Sorties]:
+    """Return sorties that each fly a block, to and fro or as planned; none where none lasts."""
+    rank = {part[0]: (at, part[1] > part[2]) for at, part in enumerate(planned)}
+    found: Sorties = []
+    short = _short(passes, merged(planned), limits.usable_l / SHORT_A_TANK)
+    for block in blocks.grown(short, limits.usable_l):
+        some = merged(block)
+        near = to_and_fro(passes, some, first=outermost(passes, some, blocks.across))
+        kept = [
+            (line, end_m, start_m) if rank[line][1] else (line, start_m, end_m)
+            for line, start_m, end_m in sorted(some, key=lambda part: rank[part[0]])
+        ]
+        ways = [linked(passes, in_sight(passes, run)) for run in (near, kept)]
+        flown = [each for way in ways if (each := plainly(passes, limits, way)) is not None]
+        if not flown:
+            return []
+        found += min(
+            flown, key=lambda every: sum(flown_by(passes, limits, each).seconds for each in every)
+        )
+    return [found]
+
+
+# A block is made of so many parts or more.
+SHORT_A_TANK = 8
+
+
+def _short(passes: Passes, parts: Sequence[Part], most_l: float) -> list[Part]:
+    """Return the parts, cut so that none needs more."""
+    found = []
+    for line, start_m, end_m in parts:
+        count = max(1, math.ceil(passes.need_l((line, start_m, end_m)) / most_l))
+        cuts_m = np.linspace(start_m, end_m, count + 1).tolist()
+        found += [(line, one, other) for one, other in pairwise(cuts_m)]
+    return found
 
 
 def _is_ragged(parts: Sequence[Part], sorties: Sequence[list[Part]]) -> bool:
@@ -369,13 +414,15 @@ def regrouped(
     *,
     trials: int,
     seed: int = 1,
+    blocks: Blocks | None = None,
 ) -> list[list[Part]]:
-    """Return sorties that take no longer than those given, after so many trials."""
+    """Return sorties that cost no more than those given, after so many trials."""
     if len(sorties) < 2 or trials <= 0:
         return list(sorties)
     draw = random.Random(seed)
     known = [list(sortie) for sortie in sorties]
-    cost_s = [flown_by(passes, limits, sortie).seconds for sortie in known]
+    cost = partial(_cost_s, passes, limits, blocks)
+    cost_s = [cost(sortie) for sortie in known]
     at = np.array([middle(passes, sortie) for sortie in known])
     along, across = np.array(course), np.array([-course[1], course[0]])
     u, v = at @ along, at @ across
@@ -393,20 +440,22 @@ def regrouped(
         if found is None:
             continue
         allowed_s = -HOT_S * (1.0 - number / trials) * math.log(1.0 - draw.random())
-        change_s = found[0] - sum(cost_s[each] for each in some)
+        new, before_s = found[1], sum(cost_s[each] for each in some)
+        if found[0] - before_s > allowed_s - LEAST_S:
+            continue
+        new_s = [cost(sortie) for sortie in new]
+        change_s = sum(new_s) - before_s
         if change_s > allowed_s - LEAST_S:
             continue
         now_s += change_s
-        new = found[1]
         if len(new) > len(some):
             known += [[] for _ in range(len(new) - len(some))]
             cost_s += [0.0] * (len(new) - len(some))
             more = np.zeros(len(new) - len(some))
             u, v = np.append(u, more), np.append(v, more)
             some += range(len(known) - len(more), len(known))
-        for place, sortie in zip(some, new, strict=False):
-            known[place] = sortie
-            cost_s[place] = flown_by(passes, limits, sortie).seconds
+        for place, sortie, each_s in zip(some, new, new_s, strict=False):
+            known[place], cost_s[place] = sortie, each_s
             at_place = middle(passes, sortie)
             u[place], v[place] = at_place @ along, at_place @ across
         for place in sorted(some[len(new) :], reverse=True):
@@ -418,6 +467,12 @@ def regrouped(
         if now_s < best_s - LEAST_S:
             best, best_s = list(known), now_s
     return best
+
+
+def _cost_s(passes: Passes, limits: Limits, blocks: Blocks | None, sortie: Sequence[Part]) -> float:
+    """Return the time of a sortie, and what it counts as that it is no block."""
+    apart_s = 0.0 if blocks is None else blocks.apart_s(sortie)
+    return flown_by(passes, limits, sortie).seconds + apart_s
 
 
 def merged(parts: Sequence[Part] | chain[Part]) -> list[Part]:

@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 import shapely
 
+from missions.blocks import Blocks
 from missions.corners import NOSE_DEG, Motion
 from missions.demand import Demand, Pieces, cut
 from missions.energy import J_WH, KG_L, Battery, Vertical
@@ -25,7 +26,7 @@ from missions.network import (
 )
 from missions.passes import Part, Passes
 from missions.plan import Kind, Leg, Place, Settings, Sortie, nose_s
-from missions.refill_search import beside, build_limits, build_passes, several
+from missions.refill_search import beside, build_limits, build_passes, main_course, several
 from missions.refills import Limits, flown_by
 from missions.search import improve
 from missions.stops import timed
@@ -125,14 +126,25 @@ class SortieSearch:
                 known = [annealed]
         found = several(
             passes, limits, self._run(order), known,
-            before=before, moves=settings.moves, seed=settings.seed,
+            before=before, moves=settings.moves, seed=settings.seed, blocks=self._blocks,
         )  # fmt: skip
         if not found:
             pieces = self._pieces
             parts = [_part(passes, pieces, 2 * at) for at in range(len(pieces))]
             raise _too_far(passes, limits, parts, self.ways, settings)
         drawn = map(self._as_flown, found)
-        return min(drawn, key=lambda each: _total_s(self.timed(each[1]), settings))
+        return min(drawn, key=self._cost_s)
+
+    def _cost_s(self, drawn: tuple[list[list[Part]], tuple[Sortie, ...]]) -> float:
+        apart_s = 0.0 if self._blocks is None else sum(map(self._blocks.apart_s, drawn[0]))
+        return _total_s(self.timed(drawn[1]), self.settings) + apart_s
+
+    @cached_property
+    def _blocks(self) -> Blocks | None:
+        """Return which passes lie beside each other; None where sorties may be stripes."""
+        if self.settings.stripes:
+            return None
+        return Blocks(self._passes, self.settings.swath_width_m, main_course(self.lines))
 
     def with_less(
         self, parts: Sequence[list[Part]], used_wh: Sequence[float], usable_wh: float
@@ -153,7 +165,7 @@ class SortieSearch:
         group = beside(passes, parts, over, NEIGHBOURS)
         found = several(
             passes, build_limits(settings, share), [], [], before=[parts[at] for at in group],
-            moves=settings.moves, seed=settings.seed,
+            moves=settings.moves, seed=settings.seed, blocks=self._blocks,
         )  # fmt: skip
         if not found:
             return None
@@ -172,6 +184,7 @@ class SortieSearch:
 
     def _as_flown(self, parts: list[list[Part]]) -> tuple[list[list[Part]], tuple[Sortie, ...]]:
         """Return the parts in the order of their sorties, and these."""
+        parts = parts if self._blocks is None else self._blocks.in_turn(parts)
         pieces, orders = _as_pieces(self._passes, parts)
         ranks, sorties = _drawn(pieces, orders, self.ways, self.flying.motion)
         return [parts[at] for at in ranks], sorties

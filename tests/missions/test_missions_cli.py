@@ -525,7 +525,7 @@ def test_choices_that_change_nothing_are_said_to_be_none(
     ):
         field = written(box(0.0, 0.0, 80.0, ground), tmp_path / "field.geojson")
         words = ["plan", str(field), "--choices", "--force", "--out", str(tmp_path / "m.plan")]
-        assert execute(words) == 0
+        assert execute([*words, "--tank-l", "100"]) == 0
         assert says in capsys.readouterr().out
 
 
