@@ -46,7 +46,7 @@ def test_a_sortie_with_more_items_than_room_is_flown_as_several(
     assert cut.length_m("spray") == pytest.approx(whole.length_m("spray"))
     rows = sheet(cut)
     assert rows["items_max"] == 20
-    assert "of 20 items" in sortie_lines(cut, rows)[0]
+    assert "the autopilot holds 20" in sortie_lines(cut, rows)[0]
 
 
 def test_one_line_with_more_items_than_room_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
