@@ -66,12 +66,12 @@ def product_of(config: Config | None) -> Product:
     """Return what the configuration says of the product."""
     if config is None:
         return NO_PRODUCT
-    table, dose = config.product, config.application
+    table, said = config.product, config.told()
     return Product(
         name=table.name,
         registration=table.registration,
-        per_l=dose.product_per_l,
-        unit=dose.product_unit or "L",
+        per_l=said.get("application.product_per_l"),
+        unit=said.get("application.product_unit", "L"),
     )
 
 

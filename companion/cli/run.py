@@ -28,7 +28,6 @@ from companion.cli.output_parts import (
 )
 from companion.cli.record_parts import FREE_MIN_BYTES, follow, made_ready
 from companion.config import Config
-from companion.config.application_table import told
 from companion.config.rules import unbounded, without_effect
 from companion.core.setup import Setup
 from companion.errors import ActuatorError, LinkError, SensorError
@@ -354,7 +353,7 @@ def _about(config: Config, overrides: Sequence[str], flight_map: FlightMap) -> d
         "config_path": str(config.path),
         "config_toml": config.source_text,
         "config_overrides": "\n".join(overrides),
-        "application_json": json.dumps(told(config.application, config.product)),
+        "application_json": json.dumps(config.told()),
         **({} if config.label is None else config.label.as_meta()),
         "flight_map_json": json.dumps(flight_map.as_object()),
     }
@@ -382,7 +381,7 @@ def _application_notes(config: Config, training: str) -> list[str]:
         return []
     from companion.config.legal_entries import missing
 
-    absent = missing(profile, told(config.application, config.product))
+    absent = missing(profile, config.told())
     if not absent:
         return []
     return [

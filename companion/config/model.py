@@ -157,8 +157,12 @@ class Config(Document):
         return None if percent == "never" else percent
 
     def told(self) -> dict[str, Any]:
-        """Return what the operator says for the record, by dotted key."""
-        return told(self.application, self.product)
+        """Return what the operator says for the record, by dotted key, and what the map implies."""
+        found = told(self.application, self.product)
+        if self.prescription is not None and self.prescription.mix_rate is not None:
+            found.setdefault("application.product_per_l", 1.0 / self.prescription.mix_rate)
+            found.setdefault("application.product_unit", "L")
+        return found
 
     def rate_max_l_ha(self) -> float | None:
         """Return the most that product and label allow; None where neither says."""

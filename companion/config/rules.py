@@ -32,6 +32,8 @@ GPIO_LAST = {"lines": 1023, "spi595": LINES_MAX - 1}
 SPAN_MIN_US = 100
 # Passes spaced by another width than the flow law's leave skips or overlaps in every pass.
 SWATH_TOLERANCE = 0.02
+# Product in the mix by the map and by the record: as far as people round.
+MIX_TOLERANCE = 0.02
 # Where none of these is written there is nothing of sensors that could contradict anything.
 _SENSOR_TABLES = frozenset({"flow_meter", "pressure", "tank", "detection"})
 
@@ -127,6 +129,16 @@ def _prescription(config: Document) -> Rule:
             key=f"prescription.{here}",
             text=f"needs prescription.{missing} as well; write the position of the mark on the "
             "map and as surveyed",
+        )
+    rate = None if table is None else table.mix_rate
+    per_l = config.application.product_per_l
+    if rate is None or per_l is None or config.application.product_unit != "L":
+        return
+    if not abs(per_l * rate - 1.0) <= MIX_TOLERANCE:
+        yield Contradiction(
+            key="prescription.mix_rate",
+            text=f"{rate:g} L of mix with 1 L of product, but application.product_per_l = "
+            f"{per_l:g} L in one; write {1.0 / rate:.4g} there, or correct mix_rate",
         )
 
 

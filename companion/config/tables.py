@@ -105,6 +105,19 @@ class PrescriptionTable(Table):
     flow_speed_m_s: float | None = Field(
         default=None, gt=0.0, le=100.0, description="speed for which a map in L/min was made"
     )
+    mix_rate: float | None = Field(
+        default=None,
+        ge=1.0,
+        le=10_000.0,
+        description="litres of spray mix with one litre of product in them, where the map's rates "
+        "are of product",
+    )
+    scale: float | None = Field(
+        default=None,
+        gt=0.0,
+        le=1000.0,
+        description="factor on all rates, where the map was made for another sprayer",
+    )
     merge: Literal["max", "average", "mean"] | None = Field(
         default=None, description="text map: of several points in a cell; max unless set"
     )

@@ -9,7 +9,7 @@ from enum import StrEnum
 
 from companion.assembly import beyond_label
 from companion.config import Config
-from companion.config.application_table import told, zone_named
+from companion.config.application_table import zone_named
 from companion.config.legal_entries import missing
 from companion.config.limits import LimitsFile
 from companion.core.label import is_hour
@@ -130,7 +130,7 @@ def application_check(config: Config) -> Check:
             "application.profile is not set: no legal record is asked for",
             'write profile = "eu", "us", "australia" or "generic" under [application]',
         )
-    absent = missing(table.profile, told(config.application, config.product))
+    absent = missing(table.profile, config.told())
     if absent:
         return warn(
             NAME,

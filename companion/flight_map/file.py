@@ -196,6 +196,8 @@ def _moved_cells(cells: CellGrid, east_m: float, north_m: float) -> CellGrid:
 _FROZEN = ("overlap", "default_rate_l_ha", "unit", "density_kg_l", "boundary", "exclusions")
 # How the source was read: a configuration that says nothing of it does not object.
 _READING = ("rate_field", "crs", "layer", "flow_width_m", "flow_speed_m_s", "merge", "origin")
+# Factors on all rates, frozen like those above.
+_FACTORS = ("mix_rate", "scale")
 _LINES = "mission.lines"
 # No setting of a configuration: the id of the plan, by which journals are sorties of one job.
 JOB_KEY = "mission.job"
@@ -207,12 +209,17 @@ def frozen_settings(
 ) -> dict[str, object]:
     """Return the settings that are frozen in a flight map, as JSON has them.
 
-    Buffers stand in it where there are any: a map without them is the same as ever.
+    Buffers and factors stand in it where there are any: a map without them is the same as ever.
     """
     found = table.model_dump(mode="json", include={*_FROZEN, *_READING})
     named = {f"prescription.{name}": found[name] for name in (*_FROZEN, *_READING)}
+    factors = {
+        f"prescription.{name}": value
+        for name, value in table.model_dump(include=set(_FACTORS)).items()
+        if value is not None
+    }
     kept = [[each.kind, each.distance_m, list(each.files)] for each in buffers]
-    return {**named, _LINES: lines, **({_BUFFERS: kept} if kept else {})}
+    return {**named, **factors, _LINES: lines, **({_BUFFERS: kept} if kept else {})}
 
 
 def difference(flight_map: FlightMap, config: Config) -> tuple[str, object, object] | None:
@@ -223,9 +230,10 @@ def difference(flight_map: FlightMap, config: Config) -> tuple[str, object, obje
     """
     if config.prescription is None:
         return None
-    for key, wanted in frozen_settings(
+    said = dict.fromkeys(f"prescription.{name}" for name in _FACTORS) | frozen_settings(
         config.prescription, config.planned_lines, config.buffers
-    ).items():
+    )
+    for key, wanted in said.items():
         compiled = flight_map.frozen.get(key)
         is_hint = key.removeprefix("prescription.") in _READING
         if is_hint and wanted is None:

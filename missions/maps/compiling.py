@@ -135,6 +135,8 @@ def read_ordered_map(order: MapOrder) -> MapFile:
             density_kg_l=table.density_kg_l,
             flow_width_m=table.flow_width_m,
             flow_speed_m_s=table.flow_speed_m_s,
+            mix_rate=table.mix_rate,
+            scale=table.scale,
             merge=table.merge,
             origin=table.origin,
         )

@@ -319,12 +319,21 @@ class Given:
     density_kg_l: float | None = None
     flow_width_m: float | None = None
     flow_speed_m_s: float | None = None
+    mix_rate: float | None = None
+    scale: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("density_kg_l", "flow_width_m", "flow_speed_m_s"):
             value = getattr(self, name)
             if value is not None and not 0.0 < value < 1e6:
                 raise ConfigError(f"{name} is {value}; give a number above 0")
+        if self.mix_rate is not None and not 1.0 <= self.mix_rate <= 1e4:
+            raise ConfigError(
+                f"mix_rate is {self.mix_rate}; give the litres of spray mix that hold one litre of "
+                "product, 1 to 10000"
+            )
+        if self.scale is not None and not 0.0 < self.scale <= 1e3:
+            raise ConfigError(f"scale is {self.scale}; give a factor above 0, up to 1000")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -455,7 +464,24 @@ def _in_litres(
             fix="check the figure, or make the map in L/ha",
         )
         problems = (*problems, problem)
-    return Unit(name=found.name, l_ha=l_ha, problems=problems)
+    factors = []
+    if given.mix_rate is not None:
+        factors.append(f"litres of product, 1 L in {given.mix_rate:g} L of spray mix")
+    if given.scale is not None:
+        factors.append(f"taken {given.scale:g} times")
+    whole = l_ha * (given.mix_rate or 1.0) * (given.scale or 1.0)
+    if factors:
+        problem = Problem(
+            severity="warning",
+            code="scaled-rates",
+            text=f"the map's rates are {', '.join(factors)}: 1 {found.name} is {whole:.6g} L/ha of "
+            "spray mix",
+            where=str(path),
+            fix="check the figure; leave out --mix-rate and --scale (prescription.mix_rate, scale) "
+            "for a map in L/ha of spray mix, such as one that was converted",
+        )
+        problems = (*problems, problem)
+    return Unit(name=found.name, l_ha=whole, problems=problems)
 
 
 def _wanted(asked: str, path: Path) -> RateUnit:

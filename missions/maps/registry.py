@@ -151,6 +151,8 @@ def read_map(
     density_kg_l: float | None = None,
     flow_width_m: float | None = None,
     flow_speed_m_s: float | None = None,
+    mix_rate: float | None = None,
+    scale: float | None = None,
     merge: str | None = None,
     origin: tuple[float, float, float] | None = None,
 ) -> MapFile:
@@ -158,16 +160,19 @@ def read_map(
 
     The arguments answer what the file leaves open: which column, band or product is the rate, in
     which unit, in which coordinate reference system, in which layer or task; the density for
-    rates by weight, width and speed for rates by time; how P2's text map makes its cells.
+    rates by weight, width and speed for rates by time, factors for rates of product or of another
+    sprayer; how P2's text map makes its cells.
     """
     path = Path(path)
     if is_flight_map(path):
-        return read_compiled(path)
+        return read_compiled(path, {"mix_rate": mix_rate, "scale": scale})
     given = Given(
         unit=unit,
         density_kg_l=density_kg_l,
         flow_width_m=flow_width_m,
         flow_speed_m_s=flow_speed_m_s,
+        mix_rate=mix_rate,
+        scale=scale,
     )
     found = _read(path, layer, merge=merge, origin=origin)
     return map_of(found, path, rate_field=rate_field, crs=crs, given=given)
@@ -444,12 +449,21 @@ def _named(found: Sequence[_Candidate], layer: str) -> list[_Candidate]:
 # A flight map read as any other map: to plan over what will be flown, and to look at it.
 
 
-def read_compiled(path: Path) -> MapFile:
+def read_compiled(path: Path, factors: Mapping[str, float | None]) -> MapFile:
     """Return a flight map in longitude and latitude; of cells, the ground of each rate.
 
-    Its rates are L/ha already, its boundary is without the exclusions.
+    Its rates are L/ha already, its boundary is without the exclusions. Factors on its rates are in
+    it: others are refused.
     """
     found = read_flight_map(path)
+    for name, value in factors.items():
+        if value is not None and value != found.frozen.get(f"prescription.{name}"):
+            raise map_error(
+                path,
+                f"its rates were compiled without {name} = {value:g}",
+                fix=f"compile its source again, or leave out {name}",
+                code="scaled-rates",
+            )
     prescription = found.prescription
     *areas, field = _degrees(
         [*(zone.polygon for zone in prescription.zones), prescription.field], found.frame

@@ -387,6 +387,22 @@ def problems_of(path: Path, *overrides: str) -> dict[str, str]:
     return {problem.where: problem.code for problem in refused.value.problems}
 
 
+def test_the_record_gets_product_in_the_mix_from_the_map() -> None:
+    mixed = load(EXAMPLE, overrides=["prescription.mix_rate=20"]).told()
+    assert mixed["application.product_per_l"] == pytest.approx(0.05)
+    assert mixed["application.product_unit"] == "L"
+    own = ["application.product_unit=L", "application.product_per_l=0.0501"]
+    told = load(EXAMPLE, overrides=["prescription.mix_rate=20", *own]).told()
+    assert told["application.product_per_l"] == 0.0501
+    own[1] = "application.product_per_l=0.1"
+    assert "write 0.05 there" in refusal(EXAMPLE, "prescription.mix_rate=20", *own)
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "0.5", "-20"])
+def test_a_mix_rate_is_at_least_the_product_itself(value: str) -> None:
+    assert "prescription.mix_rate" in refusal(EXAMPLE, f"prescription.mix_rate={value}")
+
+
 def test_a_refusal_carries_all_that_is_wrong_with_the_keys() -> None:
     given = ["lag.onn_s=1", "lag.off_s=-1", "boom.width_m=wide", "valve[2].nozzles=0"]
     assert problems_of(EXAMPLE, *given) == {

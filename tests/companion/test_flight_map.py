@@ -131,6 +131,8 @@ def test_findings_sources_and_settings_come_back(tmp_path: Path) -> None:
         ("prescription.default_rate_l_ha", "12.0"),
         ("prescription.unit", "gal/ac"),
         ("prescription.density_kg_l", "1.1"),
+        ("prescription.mix_rate", "20.0"),
+        ("prescription.scale", "0.1"),
         ("prescription.boundary", "other.geojson"),
         ("prescription.exclusions", '["pond.geojson"]'),
         ("mission.lines", "field.lines.geojson"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,10 @@ import shapely
 from shapely import Polygon
 
 from companion.cli.app import execute, refusal
+from companion.config import load
 from companion.errors import MapError
+from companion.flight_map import read_flight_map
+from companion.flight_map.file import difference
 from missions.maps.cli.app import ALIKE_SHOWN_MAX, KINDS_SHOWN_MAX, LINE_MAX, report_lines
 from missions.maps.lint import summary
 from missions.maps.model import MapFile, Problem
@@ -173,6 +177,88 @@ def test_what_the_sprayer_cannot_do_is_told_with_speed_and_place(
     code, found = run_json(capsys, "check", path, "--config", limited)
     assert (code, codes(found)[0]) == (1, "above-label")
     assert found["problems"][0]["where"].startswith("60 L/ha: zone2 at ")
+
+
+PRODUCT = ((cell(0), 0.8), (cell(5), 1.2))
+
+
+def test_rates_of_product_are_flown_as_spray_mix(capsys: Captured, tmp_path: Path) -> None:
+    path, config = write(tmp_path / "rx.geojson", *PRODUCT), write_config(tmp_path)
+    code, found = run_json(capsys, "check", path, "--config", config)
+    (asked,) = [each for each in found["problems"] if each["code"] == "other-litres"]
+    assert "litres of product?" in asked["text"] and "--mix-rate" in asked["fix"]
+    code, found = run_json(capsys, "check", path, "--config", config, "--mix-rate", "20")
+    assert (code, found["rates_l_ha"]) == (0, pytest.approx([16.0, 24.0]))
+    assert "scaled-rates" in codes(found)
+    assert "other-litres" not in codes(found)
+    made = str(tmp_path / "mix.geojson")
+    assert run_json(capsys, "convert", path, made, "--mix-rate", "20", "--scale", "0.5")[0] == 0
+    assert run_json(capsys, "check", made)[1]["rates_l_ha"] == pytest.approx([8.0, 12.0])
+
+
+def test_rates_of_a_ground_sprayer_are_asked_for_and_scaled(
+    capsys: Captured, tmp_path: Path
+) -> None:
+    path = write(tmp_path / "rx.geojson", (cell(0), 150.0), (cell(5), 200.0))
+    config = write_config(tmp_path)
+    _, found = run_json(capsys, "check", path, "--config", config)
+    (asked,) = [each for each in found["problems"] if each["code"] == "other-litres"]
+    assert "ground sprayer?" in asked["text"] and "--scale" in asked["fix"]
+    _, found = run_json(capsys, "check", path, "--config", config, "--scale", "0.1")
+    assert found["rates_l_ha"] == pytest.approx([15.0, 20.0])
+    assert "other-litres" not in codes(found)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("--mix-rate", each) for each in ("nan", "inf", "0.5", "-3", "1e9")]
+    + [("--scale", each) for each in ("nan", "inf", "0", "-1", "1e9")],
+)
+def test_a_factor_that_is_none_is_refused_in_one_line(
+    capsys: Captured, tmp_path: Path, option: str, value: str
+) -> None:
+    path = write(tmp_path / "rx.geojson", *PRODUCT)
+    code, found = run_json(capsys, "check", path, option, value)
+    assert (code, option[2:].replace("-", "_") in found["error"]) == (2, True)
+    assert "\n" not in found["error"]
+
+
+def test_a_flight_map_remembers_its_factors_and_takes_no_others(
+    capsys: Captured, tmp_path: Path
+) -> None:
+    write(tmp_path / "rx.geojson", *PRODUCT)
+    config = write_config(
+        tmp_path, more='[application]\nproduct_unit = "L"\nproduct_per_l = 0.05\n'
+    )
+    text = re.sub(
+        r"(?ms)^\[prescription\].*?(?=^\[)",
+        '[prescription]\nfile = "rx.geojson"\nmix_rate = 20.0\n\n',
+        Path(config).read_text(),
+    )
+    Path(config).write_text(text)
+    out = str(tmp_path / "f.flightmap.gpkg")
+    code, found = run_json(
+        capsys, "compile", str(tmp_path / "rx.geojson"), "--out", out, "--config", config
+    )
+    assert (code, found["rates_l_ha"]) == (0, pytest.approx([16.0, 24.0]))
+    assert "scaled-rates" in codes(found)
+    flight_map = read_flight_map(Path(out))
+    assert flight_map.frozen["prescription.mix_rate"] == 20.0
+    assert run_json(capsys, "check", out, "--mix-rate", "20")[0] == 0
+    assert run_json(capsys, "check", out, "--mix-rate", "10")[0] == 2
+    assert run_json(capsys, "check", out, "--scale", "0.1")[0] == 2
+    loaded = load(Path(config), overrides=[f"prescription.file={out}"])
+    assert difference(flight_map, loaded) is None
+    # Without the factor the configuration means another map.
+    plain = load(
+        Path(config), overrides=[f"prescription.file={out}", "prescription.mix_rate=25.0",
+                                 "application.product_per_l=0.04"],
+    )  # fmt: skip
+    told = difference(flight_map, plain)
+    assert told is not None and told[0] == "prescription.mix_rate"
+    Path(config).write_text(text.replace("mix_rate = 20.0\n", ""))
+    told = difference(flight_map, load(Path(config)))
+    assert told == ("prescription.mix_rate", None, 20.0)
 
 
 def test_a_setting_is_changed_for_one_check_and_for_one_plan(

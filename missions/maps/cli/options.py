@@ -10,10 +10,11 @@ from typing import Annotated, Any, get_args
 import typer
 from shapely import MultiPolygon
 
-from companion.assembly import above_label, beyond_label, undelivered
+from companion.assembly import above_label, beyond_label, flow_range, undelivered
 from companion.cli.answer import Option, Overrides, note, with_options
 from companion.config import Config, load
 from companion.config.tables import PrescriptionTable
+from companion.core.nozzle import rate_for_flow
 from companion.core.prescription import Overlap
 from companion.errors import MapError
 from missions.maps.cli.new import parse_place
@@ -46,6 +47,16 @@ _FlowWidth = Annotated[
 ]
 _FlowSpeed = Annotated[
     float | None, typer.Option(metavar="M_S", help="Speed for which a map in L/min was made.")
+]
+_MixRate = Annotated[
+    float | None,
+    typer.Option(
+        metavar="L", help="Litres of mix with one litre of product, for a map of product."
+    ),
+]
+_Scale = Annotated[
+    float | None,
+    typer.Option(metavar="FACTOR", help="Takes all rates so many times: 0.1 flies 150 L/ha at 15."),
 ]
 _Merge = Annotated[
     str | None,
@@ -84,7 +95,7 @@ _ConfigFile = Annotated[
 
 
 # What a configuration says of the map that it names, and of no other.
-_OF_ONE_FILE = frozenset({"rate_field", "layer", "merge", "origin"})
+_OF_ONE_FILE = frozenset({"rate_field", "layer", "merge", "origin", "mix_rate", "scale"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,6 +109,8 @@ class Reading:
     density_kg_l: float | None = None
     flow_width_m: float | None = None
     flow_speed_m_s: float | None = None
+    mix_rate: float | None = None
+    scale: float | None = None
     merge: str | None = None
     origin: tuple[float, float, float] | None = None
     config: Config | None = None
@@ -159,6 +172,8 @@ _OPTIONS = {
     "density_kg_l": Option(_Density),
     "flow_width_m": Option(_FlowWidth),
     "flow_speed_m_s": Option(_FlowSpeed),
+    "mix_rate": Option(_MixRate),
+    "scale": Option(_Scale),
     "merge": Option(_Merge),
     "origin": Option(_Origin),
     "config_file": Option(_ConfigFile),
@@ -190,6 +205,8 @@ reading_options = with_options("reading", _OPTIONS, _reading)
 RATES_MAX = 1_000
 # Less than this is what rounding moves.
 KEPT_MIN_M2 = 0.01
+# Rates so many times beyond what the sprayer applies are of another sprayer, or of product.
+FAR = 2.0
 
 
 def plan_of(config: Config | None, home: tuple[float, float] | None) -> tuple[Plan, list[Problem]]:
@@ -277,7 +294,11 @@ def sprayer_problems(config: Config | None, map_file: MapFile, plan: Plan) -> li
     rates = rates_in_force(map_file, plan)
     if config is None or not rates:
         return []
-    of_label = [*beyond_label(config), *_kept_free(config, map_file, plan)]
+    of_label = [
+        *beyond_label(config),
+        *_kept_free(config, map_file, plan),
+        *_other_litres(config, map_file.path, [rate for rate in rates if rate > 0.0]),
+    ]
     label = above_label(
         config,
         map_file.path,
@@ -308,6 +329,33 @@ def sprayer_problems(config: Config | None, map_file: MapFile, plan: Plan) -> li
         replace(problem, where=problem.where or _where(survey, where[problem.code], plan))
         for problem in found
     ]
+
+
+def _other_litres(config: Config, path: Path, rates_l_ha: Sequence[float]) -> Iterator[Problem]:
+    """Ask whether rates far from all that this sprayer applies are litres of something else."""
+    if config.mission is None or not rates_l_ha:
+        return
+    low, high = (
+        rate_for_flow(flow, config.mission.speed_m_s, config.boom_table.width_m)
+        for flow in flow_range(config.nozzle_sets(), config.pwm_limits())
+    )
+    said = f"{min(rates_l_ha):g} to {max(rates_l_ha):g} L/ha, where this sprayer applies {low:.3g}"
+    said += f" to {high:.3g} L/ha at {config.mission.speed_m_s:g} m/s"
+    asked, fix = "", ""
+    if max(rates_l_ha) < low / FAR:
+        asked = "litres of product"
+        fix = "say how many litres of spray mix hold one of product with --mix-rate"
+    elif min(rates_l_ha) > high * FAR:
+        asked = "for a ground sprayer"
+        fix = "take a part of them with --scale, such as --scale 0.1"
+    if asked:
+        yield Problem(
+            severity="warning",
+            code="other-litres",
+            text=f"are these rates {asked}? They are {said}",
+            where=str(path),
+            fix=f"if so, {fix} (prescription.mix_rate, scale)",
+        )
 
 
 def _kept_free(config: Config, map_file: MapFile, plan: Plan) -> list[Problem]:
