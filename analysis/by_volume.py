@@ -32,6 +32,8 @@ SCATTER_M, NOISE = 0.2, 0.01
 ROUNDS = 5
 # Where less than this of both doses falls at a middle, the valve was not open there.
 OPEN_FROM = 0.5
+# Where the strip gets narrower than this, it turns: what it drops there says nothing of a change.
+STRAIGHT_FROM = 0.9
 DRY_BELOW = 0.02
 
 
@@ -63,8 +65,9 @@ def late_by_volume(
         from_m, to_m = track.at(smooth.distance_m, ends_s)
         given: Floats = np.diff(track.at(smooth.volume_ml, ends_s), axis=0)[0]
         asked = before * (at_m - from_m) + after * (to_m - at_m)
-        least = OPEN_FROM * np.minimum(before, after)
+        least, across_m = OPEN_FROM * np.minimum(before, after), track.at(track.across_m, ends_s)
         is_open = np.all(smooth.dose_ml_m[track.samples(ends_s)] >= least, axis=0) & (asked > 0.0)
+        is_open &= across_m.min(axis=0) >= STRAIGHT_FROM * across_m.max(axis=0)
         late_m, way_m = _late_m(number, is_open, np.stack((given, asked, step))), to_m - from_m
     is_told = np.isfinite(late_m)
     values = zip(late_m[is_told].tolist(), way_m[is_told].tolist(), strict=True)

@@ -260,6 +260,31 @@ def passed_of(flights: list[Truth], ground: Field) -> Any:
     return shapely.union_all(found)
 
 
+@dataclass(frozen=True)
+class Exported:
+    """What a file of swaths holds, where there is no truth: litres, and the ground under them."""
+
+    applied_l: float
+    treated_m2: float
+    outside_ml: float
+
+
+def swaths_of(path: Path, origin_deg: tuple[float, float], ground: Field) -> Exported:
+    """Return the figures of a GeoJSON of swaths, each spread evenly over its own polygon."""
+    swaths = ground_of(path, origin_deg)
+    outline = ground.outline.buffer(1e-3)
+    outside_ml = sum(
+        float(said["volume_ml"]) * shape.difference(outline).area / shape.area
+        for shape, said in swaths
+        if shape.area > 0.0
+    )
+    return Exported(
+        applied_l=sum(float(said["volume_ml"]) for _, said in swaths) / 1e3,
+        treated_m2=float(shapely.union_all([shape for shape, _ in swaths], grid_size=1e-4).area),
+        outside_ml=outside_ml,
+    )
+
+
 def points_of(truth: Truth) -> tuple[Floats, Floats]:
     """Return places and millilitres of all that fell, in pieces of a few centimetres."""
     places, drops = [], []

@@ -93,7 +93,7 @@ def causes_of(
     """Return where the ground that is off comes from."""
     area = dict.fromkeys(Cause, 0.0)
     inhibits: dict[str, float] = {}
-    passed_m2 = 0.0
+    passed_m2 = closed_m2 = 0.0
     for strip in strips:
         marks = marks_of(strip, flight.setup)
         passed_m2 += float(marks.area_m2.sum())
@@ -102,9 +102,14 @@ def causes_of(
         for cause, where in _sorted(flight, marks, off, own):
             is_edge = cause is Cause.EDGE
             area[cause] += _edge_m2(marks, where) if is_edge else float(marks.area_m2[where].sum())
+            if not is_edge:
+                closed_m2 += float(marks.area_m2[where & _is_closed(marks)].sum())
             if cause is Cause.INHIBIT:
                 for reason, its in by_inhibit(flight, marks, where).items():
                     inhibits[reason] = inhibits.get(reason, 0.0) + its
+    # Bare ground at the border lies under strips whose middles are outside, too: by the ground.
+    edge_m2 = ground.missed_m2 - ground.between_m2 - closed_m2
+    area[Cause.EDGE] = max(area[Cause.EDGE], edge_m2)
     area[Cause.OVERLAP] = ground.doubled_m2
     area[Cause.SKIP] += ground.between_m2
     return Causes(
@@ -137,12 +142,17 @@ def _is_off(marks: Marks) -> Bools:
     return off
 
 
+def _is_closed(marks: Marks) -> Bools:
+    closed: Bools = marks.given_ml_m < SKIPPED_BELOW * marks.asked_ml_m
+    return closed
+
+
 def _sorted(
     flight: AppliedFlight, marks: Marks, off: Bools, steps: Sequence[Step]
 ) -> list[tuple[Cause, Bools]]:
     """Return where each cause is to blame; no mark has two."""
     short = marks.given_ml_m < marks.asked_ml_m
-    closed = off & (marks.given_ml_m < SKIPPED_BELOW * marks.asked_ml_m)
+    closed = off & _is_closed(marks)
     rules = (
         (Cause.OPERATOR, as_wished(flight, marks, OFF_BY)),
         (Cause.INHIBIT, marks.is_inhibited(flight) & short),

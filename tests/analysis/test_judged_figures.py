@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import os
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -24,7 +26,7 @@ from analysis.flown.read_applied import read_applied
 from analysis.report.build import Report, ReportOptions, build_report
 from analysis.report.job import build_job
 from companion.cli.app import execute
-from tests.ground_judge import Field, Truth, Verdict, doses_of, judge, to_local
+from tests.ground_judge import Field, Truth, Verdict, doses_of, judge, swaths_of, to_local
 
 EXAMPLE = Path("examples/anyang/config.toml")
 # Areas to 1 % of the field, litres to 0.5 %.
@@ -44,6 +46,7 @@ ASKEW = (
 class Flown:
     """A simulated flight: what was printed of it, and what the truth says."""
 
+    journal: Path
     truth: Truth
     field: Field
     verdict: Verdict
@@ -55,6 +58,15 @@ class Flown:
 
 def fly(folder: Path, zones: Any, lines: bool, *more: str) -> Flown:
     """Plan and fly a field without scatter of valves or meter, and make its report."""
+    if isinstance(zones[-1], list):
+        zones, trees = zones
+        points = {"type": "MultiPoint", "coordinates": trees}
+        marks = [{"type": "Feature", "properties": {}, "geometry": points}]
+        (folder / "trees.geojson").write_text(
+            json.dumps({"type": "FeatureCollection", "features": marks})
+        )
+        more = (*more, "--obstacle", str(folder / "trees.geojson"))
+        more = (*more, "--obstacle-radius-m", "2")
     features = [
         {
             "type": "Feature",
@@ -105,6 +117,7 @@ def flown_of(folder: Path, plan: Path, out: Path) -> Flown:
     journal = out / "flight-0001.gpkg"
     report = build_report(journal, ReportOptions(with_figures=False))
     return Flown(
+        journal=journal,
         truth=truth,
         field=ground,
         verdict=judge([truth], ground),
@@ -115,11 +128,29 @@ def flown_of(folder: Path, plan: Path, out: Path) -> Flown:
     )
 
 
-FLIGHTS = {
+def real_outline(name: str) -> tuple[Any, list[tuple[float, float]]]:
+    """Return a real outline, moved to the example's place, as a map of one rate, and two trees."""
+    path = Path(os.environ["VRSPRAY_SAMPLES"]) / "fields" / f"{name}.geojson"
+    shape = shapely.from_geojson(path.read_text())
+    whole = max(shapely.get_parts(shapely.get_parts(shape)), key=lambda each: each.area)
+    west, south = whole.bounds[:2]
+    stretch = math.cos(math.radians(south)) / math.cos(math.radians(35.996))
+
+    def moved(ring: Any) -> list[tuple[float, float]]:
+        return [(114.544 + (x - west) * stretch, 35.996 + y - south) for x, y in ring.coords]
+
+    corners = moved(whole.exterior)[:-1]
+    inside = moved(whole.representative_point())
+    return ((20, corners),), [*inside, corners[len(corners) // 3]]
+
+
+FLIGHTS: dict[str, tuple[Any, ...]] = {
     "tutorial": (TUTORIAL, True, "--angle-deg", "0"),
     "one of three": (ASKEW, True, "--tank-l", "5"),
     "without lines": (TUTORIAL, False, "--angle-deg", "0"),
 }
+if "VRSPRAY_SAMPLES" in os.environ:
+    FLIGHTS["real outline, trees"] = (real_outline("r_ai4sf"), True)
 
 
 @pytest.fixture(scope="module", params=FLIGHTS)
@@ -140,6 +171,13 @@ def test_ground_is_what_the_truth_says(flown: Flown) -> None:
     assert said["untreated_percent"] == pytest.approx(percent, abs=1.0)
 
 
+def test_causes_hold_all_ground_that_is_bare_or_treated_twice(flown: Flown) -> None:
+    causes = flown.contents["causes"]
+    bare_m2 = flown.verdict.missed_m2 + flown.verdict.twice_m2
+    assert causes["off_m2"] >= bare_m2 - AREA * flown.verdict.field_m2
+    assert causes["off_m2"] == pytest.approx(sum(causes["area_m2"].values()))
+
+
 def test_litres_are_what_the_truth_says(flown: Flown) -> None:
     said, true = flown.contents["verdict"], flown.verdict
     for name in ("applied_l", "metered_l", "modelled_l"):
@@ -148,6 +186,45 @@ def test_litres_are_what_the_truth_says(flown: Flown) -> None:
     assert said["outside_ml"] == pytest.approx(true.outside_ml, abs=0.5)
     assert flown.result["off_target_ml"] == pytest.approx(true.outside_ml, abs=0.5)
     assert said["off_line_ml"] == pytest.approx(true.off_line_ml, abs=1.0)
+
+
+def test_the_swaths_of_a_journal_alone_say_the_same(flown: Flown, tmp_path: Path) -> None:
+    out, true = tmp_path / "swaths.geojson", flown.verdict
+    words = ["export", str(flown.journal), "--out", str(out), "--geometry", "swaths", "--json"]
+    assert execute(words) == 0
+    said = swaths_of(out, flown.truth.origin_deg, flown.field)
+    assert said.applied_l == pytest.approx(true.applied_l, rel=LITRES)
+    assert said.treated_m2 == pytest.approx(true.treated_m2, abs=AREA * true.field_m2)
+    assert said.outside_ml == pytest.approx(true.outside_ml, abs=0.01 * 1e3 * true.applied_l)
+
+
+def test_fleet_and_flights_print_what_the_truth_says(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    true, fleet = flown.verdict, str(tmp_path / "fleet")
+
+    def said(*words: str) -> dict[str, Any]:
+        capsys.readouterr()
+        assert execute([*words, "--json"]) == 0
+        found: dict[str, Any] = json.loads(capsys.readouterr().out)
+        return found
+
+    said("fleet", "add", str(flown.journal), "--into", fleet)
+    (row,) = said("fleet", "query", "SELECT * FROM flights", "--fleet", fleet)["rows"]
+    within = {"abs": AREA * true.field_m2}
+    assert row["area_ha"] * 1e4 == pytest.approx(true.treated_m2, **within)
+    assert row["missed_m2"] == pytest.approx(true.missed_m2, **within)
+    assert row["doubled_m2"] == pytest.approx(true.twice_m2, **within)
+    assert row["untreated_m2"] == pytest.approx(true.bare_m2, **within)
+    for name in ("applied_l", "modelled_l"):
+        assert row[name] == pytest.approx(true.applied_l, rel=LITRES), name
+    assert row["outside_ml"] == pytest.approx(true.outside_ml, abs=0.5)
+    (listed,) = said("flights", "list", "--folder", str(flown.journal.parent))["flights"]
+    # The running sum of the companion, and no model of lags.
+    assert listed["applied_l"] == pytest.approx(true.applied_l, rel=2.0 * LITRES)
+    rest = said("flights", "remaining", str(flown.journal), "--out", str(tmp_path / "rest.geojson"))
+    assert rest["treated_ha"] * 1e4 == pytest.approx(true.treated_m2, **within)
+    assert rest["field_ha"] * 1e4 == pytest.approx(true.field_m2, rel=1e-3)
 
 
 def test_metered_and_modelled_litres_are_the_same_in_all_files(flown: Flown) -> None:
