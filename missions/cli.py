@@ -52,6 +52,7 @@ from missions.reading_outline import CORRIDOR_MAX_M, RADIUS_MAX_M
 from missions.remaining import UntreatedRates
 from missions.searching import Watch, watched
 from missions.sheet import sheet, sortie_lines
+from missions.treated import treated_by, treated_lines
 
 # Attempted moves of the search: about one second, ten, and a minute on an old laptop.
 MOVES = {"quick": 40_000, "good": 300_000, "best": 2_000_000}
@@ -124,9 +125,14 @@ def plan(
         typer.Option(metavar="V", help="Speed up to this where rates are too low for the valves."),
     ] = None,
     border_m: Annotated[
-        float,
-        typer.Option(metavar="M", help="Distance of passes from every border.", min=0.0, max=50.0),
-    ] = 0.0,
+        float | None,
+        typer.Option(
+            metavar="M",
+            help="Distance of passes from every border; default: what keeps outer valves open.",
+            min=0.0,
+            max=50.0,
+        ),
+    ] = None,
     ends_over: Annotated[
         bool,
         typer.Option(
@@ -229,8 +235,8 @@ def plan(
     """Plan the passes over a field, sortie by sortie, and write the mission.
 
     A .plan or .waypoints file holds one sortie; the second and later ones are numbered beside it.
-    "Covered" is what the passes reach with the whole boom open. A report says of a flight what was
-    left untreated: that includes what the valves kept dry, along the border for example.
+    "Treated" is what the flight leaves treated: valves stay closed where the aircraft is too slow
+    or turns, along the border and over treated ground. "Covered" is what the passes reach.
     """
     start = perf_counter()
     _check_outputs(out, png, pilot_sheet, first, force=force)
@@ -289,6 +295,7 @@ def plan(
                 task.field, task.settings, task.rates, depots=task.depots, left=task.left,
                 around=task.around, with_sprayer=sprayer, fences=fences if is_fenced else None,
             )  # fmt: skip
+    is_rest = task.left is not None or isinstance(task.rates, UntreatedRates)
     flown_s = [planned.airborne_s(sortie) for sortie in planned.sorties]
     by_label = label_warnings(reading.config, flown_s, datetime.now(tz=UTC).timestamp())
     planned = replace(
@@ -300,15 +307,15 @@ def plan(
             *lines_warnings(planned, reading.config),
         ),
         wind=task.wind,
+        treated=None if is_rest else treated_by(planned, task.rates),
         settings=with_tank(planned.settings, in_tank_l),
     )
     took_s = perf_counter() - start
     choices: list[tuple[Price, str]] = []
     asks = choices_too or overlap_max is not None or leave_max > LEAVE_PERCENT
-    is_whole = task.left is None and not isinstance(task.rates, UntreatedRates)
-    if asks and is_whole and not watch.stopped:
+    if asks and not is_rest and not watch.stopped:
         choices = _priced(planned, task)
-    none = [no_choices(planned)] if choices_too and is_whole and not watch.stopped else []
+    none = [no_choices(planned)] if choices_too and not is_rest and not watch.stopped else []
     goes_on = resume is not None or done is not None
     mix = mix_of(reading.config, planned, task.rates, goes_on=goes_on)
     lines_before = lines_beside(out)
@@ -348,7 +355,7 @@ def plan(
     result["warnings"] = list(warnings)
     said = _choices(planned, result, [text for _, text in choices] or none, asked=asks or sprayer)
     answer(
-        result, [*_lines(planned, result, files), *(f"choice    {text}" for text in said)],
+        result, [*_lines(planned, result, files, task), *(f"choice    {text}" for text in said)],
         as_json=as_json,
     )  # fmt: skip
     own = f"{field} itself: it is a prescription too" if asked.prescription == field else ""
@@ -467,7 +474,7 @@ def _once(planned: Plan) -> str:
     return ", treated ground not again, as the litres count" if planned.closes else ""
 
 
-def _lines(planned: Plan, result: dict[str, Any], files: list[Path]) -> list[str]:
+def _lines(planned: Plan, result: dict[str, Any], files: list[Path], task: Task) -> list[str]:
     """Return the plan in words."""
     coverage = planned.coverage
     minutes = sum(map(planned.airborne_s, planned.sorties)) / 60.0
@@ -477,6 +484,7 @@ def _lines(planned: Plan, result: dict[str, Any], files: list[Path]) -> list[str
     lines = [
         f"{names_of(files)}: {counted(len(planned.sorties), 'sortie')}, {planned.volume_l:.1f} L, "
         f"{minutes:.0f} min in the air",
+        *treated_lines(planned, task.rates, has_runs=task.around.run_in is not None),
         f"covered   {coverage.percent:.2f} % of {ground_text(result)}, "
         f"{coverage.overlap_percent:.2f} % {_TWICE[planned.closes]}, "
         f"{coverage.outside_m2:.1f} m2 outside",

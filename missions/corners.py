@@ -102,17 +102,24 @@ def parts_s(
     """
     if rule == "px4":
         return _slowed_s(lengths_m, bends_deg, courses)
-    legs = [_Leg.of(length, course) for length, course in zip(lengths_m, courses, strict=True)]
+    legs, overlaps_s = overlapping(lengths_m, bends_deg, courses)
     seconds = [leg.seconds for leg in legs]
     if rule == "ardupilot":
-        bends = [math.radians(bend_deg) for bend_deg in bends_deg]
-        overlaps_s = _overlaps_s(list(zip(legs, legs[1:], bends, strict=False)))
         for number, (overlap_s, bend_deg) in enumerate(
             zip(overlaps_s, bends_deg, strict=True), start=1
         ):
             seconds[number] -= overlap_s
             seconds[number] += LAGS_S if abs(bend_deg) > LAGGING_DEG else 0.0
     return seconds
+
+
+def overlapping(
+    lengths_m: Sequence[float], bends_deg: Sequence[float], courses: Sequence[Course]
+) -> tuple[list[_Leg], list[float]]:
+    """Return the parts from rest to rest, and how long before its end each lets the next begin."""
+    legs = [_Leg.of(length, course) for length, course in zip(lengths_m, courses, strict=True)]
+    bends = [math.radians(bend_deg) for bend_deg in bends_deg]
+    return legs, _overlaps_s(list(zip(legs, legs[1:], bends, strict=False)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,6 +144,19 @@ class _Leg:
             course=course, peak_m_s=peak, reaching_s=reaching_s,
             seconds=2.0 * reaching_s + cruise_s,
         )  # fmt: skip
+
+    def way_m(self, at_s: Floats) -> Floats:
+        """Return how far along it is at some times; before it and after it, at its ends."""
+        whole_m = self.peak_m_s * (self.seconds - self.reaching_s)
+        cruise_s = np.clip(at_s - self.reaching_s, 0.0, self.seconds - 2.0 * self.reaching_s)
+        first, last = (
+            _speeding_up([self], np.clip(each, 0.0, self.reaching_s))[0][0]
+            for each in (at_s, self.seconds - at_s)
+        )
+        found: Floats = (
+            first + self.peak_m_s * cruise_s - last + self.peak_m_s * self.reaching_s / 2.0
+        )
+        return np.clip(found, 0.0, whole_m)
 
     @property
     def jerk_s(self) -> float:

@@ -25,7 +25,7 @@ from missions.maps.local import polygons_of
 from missions.maps.model import write_whole
 from missions.maps.picture import STYLE, SUFFIXES, Sheet, content_of, printable, sheet_for
 from missions.plan import Leg, Plan, Sortie
-from missions.strips import GRID_M, Objects, whole
+from missions.strips import sprayed_twice, whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -58,14 +58,6 @@ def draw_plan(plan: Plan, out: Path, *, title: str) -> None:
     with rc_context(STYLE):
         content = content_of(_figure(plan, sheet, title), suffix, dpi=dpi)
     write_whole(out, content)
-
-
-def sprayed_twice(strips: Objects) -> BaseGeometry:
-    """Return the ground that lies under more than one strip."""
-    tree = shapely.STRtree(strips)
-    one, other = tree.query(strips, predicate="intersects")
-    keep = one < other
-    return whole(shapely.intersection(strips[one[keep]], strips[other[keep]], grid_size=GRID_M))
 
 
 def _figure(plan: Plan, sheet: Sheet, title: str) -> Figure:
@@ -151,15 +143,17 @@ def _draw_strips(axes: Axes, plan: Plan, *, swath_pt: float) -> dict[str, bool]:
             linewidths=min(0.5, 0.03 * swath_pt), zorder=2.0,
         )  # fmt: skip
     strips = np.concatenate(everything)
-    twice = _seen(sprayed_twice(strips))
+    found = plan.treated
+    twice = _seen(sprayed_twice(strips) if found is None else found.twice)
     # Ground of a line on which nothing is prescribed is not missed.
     planned = boom.united(plan.lines)
-    skipped = _seen(shapely.difference(plan.field.limit, planned))
+    skipped = shapely.difference(plan.field.limit, planned) if found is None else found.bare
+    skipped = _seen(skipped)
     bare = _seen(shapely.difference(planned, whole(strips)))
     _fill(axes, [twice], facecolors=TWICE, alpha=0.38, linewidths=0.0, zorder=3.0)
     _fill(axes, [skipped], facecolors=SKIPPED, edgecolors=SKIPPED, linewidths=1.0, zorder=6.0)
-    found = {"twice": twice, "skipped": skipped, "bare": bare}
-    return {name: not area.is_empty for name, area in found.items()}
+    seen = {"twice": twice, "skipped": skipped, "bare": bare}
+    return {name: not area.is_empty for name, area in seen.items()}
 
 
 def _seen(area: BaseGeometry) -> BaseGeometry:
@@ -311,10 +305,16 @@ def write_title(figure: Figure, plan: Plan, title: str) -> None:
     wide_in, high_in = figure.get_figwidth(), figure.get_figheight()
     count = len(plan.sorties)
     doubled = "under two passes" if plan.closes else "twice"
+    found = plan.treated
+    treated = (
+        f"covered {plan.coverage.percent:.2f} %"
+        if found is None
+        else f"treated {found.percent:.1f} %"
+    )
     figures = (
         f"{plan.field.area_m2 / 1e4:.2f} ha    {plan.volume_l:,.1f} L    "
         f"{_duration(plan.total_s)} with refills    "
-        f"{counted(count, 'sortie')}    covered {plan.coverage.percent:.2f} %    "
+        f"{counted(count, 'sortie')}    {treated}    "
         f"{doubled} {plan.coverage.overlap_percent:.2f} %    "
         f"ferry {plan.length_m('ferry') / 1e3:.1f} km"
     )
@@ -396,7 +396,8 @@ def write_legend(figure: Figure, plan: Plan, seen: dict[str, bool], *, left: flo
         ),
     ]  # fmt: skip
     if seen["twice"]:
-        label = "under two passes (valves close)" if plan.closes else "sprayed twice"
+        closes = plan.closes and plan.treated is None
+        label = "under two passes (valves close)" if closes else "sprayed twice"
         handles.append(Patch(facecolor=TWICE, alpha=0.45, label=label))
     if seen["skipped"]:
         handles.append(Patch(facecolor=SKIPPED, label="left unsprayed"))

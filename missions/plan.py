@@ -9,6 +9,7 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
+from shapely.geometry.base import BaseGeometry
 
 from companion.core.frame import LocalFrame
 from missions.corners import NOSE_DEG, NOSE_DEG_S, CornerRule, Motion, Turn
@@ -43,6 +44,7 @@ class Settings:
     an end of the boom may be beyond the border, where its valves are closed.
     `in_tank_l` is the mix that is in the first aircraft's tank before its first sortie.
     Sorties are blocks from side to side; as `stripes` they may lie in between each other.
+    On a line is who is no farther aside and off its course (`mission.lines_aside_m`).
     Without them, `jerk_m_s3` and `return_height_m` are those that the autopilot comes with.
     """
 
@@ -77,6 +79,8 @@ class Settings:
     ends_over: bool = False
     in_tank_l: float = 0.0
     stripes: bool = False
+    lines_aside_m: float = 1.0
+    lines_course_deg: float = 20.0
 
     def __post_init__(self) -> None:
         for name in ("swath_width_m", "speed_m_s", "height_m", "acceleration_m_s2", "tank_l"):
@@ -239,6 +243,28 @@ def flown_lines(sorties: Sequence[Sortie]) -> Floats:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Treated:
+    """What the flight leaves `bare` of the ground that has a rate, and what it treats `twice`."""
+
+    ground_m2: float
+    bare: BaseGeometry
+    twice: BaseGeometry
+
+    @property
+    def percent(self) -> float:
+        """Return how much of the ground that has a rate is treated."""
+        return 100.0 * (1.0 - float(self.bare.area) / max(self.ground_m2, 1e-9))
+
+    def summary(self) -> dict[str, float]:
+        """Return the figures."""
+        return {
+            "treated_percent": self.percent,
+            "bare_m2": float(self.bare.area),
+            "twice_m2": float(self.twice.area),
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
     """The whole mission; `lines` are all spray lines before they were cut into sorties.
 
@@ -256,6 +282,7 @@ class Plan:
     warnings: tuple[str, ...] = ()
     terrain: Terrain | None = None
     wind: tuple[float, float] | None = None
+    treated: Treated | None = None
 
     @property
     def frame(self) -> LocalFrame:
@@ -323,6 +350,11 @@ class Plan:
             "outside_m2": self.coverage.outside_m2,
             "largest_skip_m2": self.coverage.largest_skip_m2,
             "simpler_border_m2": self.field.given_up_m2,
+            **(
+                dict.fromkeys(("treated_percent", "bare_m2", "twice_m2"))
+                if self.treated is None
+                else self.treated.summary()
+            ),
             "without_rate_ha": self.coverage.without_rate_m2 / 10_000.0,
             "holes": asdict(self.field.holes),
             "area_ha": self.field.area_m2 / 10_000.0,

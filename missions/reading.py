@@ -62,6 +62,8 @@ FERRY_CLEARANCE_M = 5.0
 # Options that are not called as their keys are.
 OPTIONS = {"swath_width_m": "swath_m"}
 SPEED_MAX_M_S = 50.0
+# So far an aircraft may be off its line: above the 0.09 m of the twin's flights in gusts.
+SWAY_M = 0.1
 # What a configuration says of its own map, and so of others of the same farm.
 OF_ALL_MAPS = ("unit", "crs", "density_kg_l", "flow_width_m", "flow_speed_m_s")
 
@@ -98,7 +100,7 @@ class Asked:
     rate_l_ha: float | None = None
     crs: str | None = None
     answers: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    border_m: float = 0.0
+    border_m: float | None = None
     over_holes: bool = False
     ends_over: bool = False
     with_sprayer: bool = False
@@ -143,7 +145,7 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
         swath_width_m=settings.swath_width_m,
         frame=frame,
         offset_m=offset_m,
-        kept_m=asked.border_m,
+        kept_m=_inset_m(asked, settings),
         tolerance_m=OUTLINE_TOLERANCE_M if mission is None else mission.outline_tolerance_m,
         ferry_over_m=_ferry_over_m(settings, mission),
     )
@@ -291,6 +293,8 @@ def _settings(config: Config | None, changes: dict[str, float | int | None]) -> 
             border_buffer_m=_kept_m(config),
             # What is planned are lines, and named as such they alone are sprayed.
             switch_off_percent=config.switch_off_percent(on_lines=True),
+            lines_aside_m=mission.lines_aside_m,
+            lines_course_deg=mission.lines_course_deg,
             **fleet_settings(mission),
         )
     given: dict[str, Any] = {name: each for name, each in changes.items() if each is not None}
@@ -469,6 +473,17 @@ def _flows(config: Config) -> tuple[float, float]:
     """Return what the nozzle sets deliver over the swath, which may be a little off the boom."""
     low, high = flow_range(config.nozzle_sets(), config.pwm_limits())
     return low, high
+
+
+def _inset_m(asked: Asked, settings: Settings) -> float:
+    """Return how far passes keep from every border: so far that no outer valve closes on them.
+
+    That is the companion's own distance and what an aircraft sways about its line.
+    """
+    if asked.border_m is not None:
+        return asked.border_m
+    closes = settings.border_buffer_m is not None and not asked.with_sprayer
+    return (settings.border_buffer_m or 0.0) + SWAY_M if closes and not asked.ends_over else 0.0
 
 
 def _kept_m(config: Config) -> float | None:

@@ -24,7 +24,7 @@ from missions.maps.local import grown
 from missions.maps.registry import read_area
 from missions.plan import Settings
 from missions.reading_outline import near_features, told
-from missions.surroundings import RunIn
+from missions.surroundings import OVERRUN_M, RunIn
 from missions.terrain import Terrain, read_dem
 
 Autopilot = Literal["ardupilot", "px4"]
@@ -205,7 +205,7 @@ def run_in_of(
         for area in areas
     ]
     if mission.overrun == "allowed":
-        outside.append(field.outline.convex_hull.buffer(500.0))
+        outside.append(field.outline.convex_hull.buffer(OVERRUN_M))
     ground = None
     if outside:
         # Ground beside the field is digitised with cracks to it, over which one may fly.

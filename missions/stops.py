@@ -8,10 +8,13 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import NamedTuple
 
+import numpy as np
+
 from companion.core.frame import LocalFrame
 from companion.wording import counted
-from missions.corners import Course, parts_s
+from missions.corners import Course, Ints, overlapping, parts_s
 from missions.plan import Leg, Place, Settings, Sortie
+from missions.strips import Floats
 
 # Waypoints closer than this to the one before say nothing new: a border goes on in its next line.
 SAME_M = 0.6
@@ -275,6 +278,54 @@ def _timed(sortie: Sortie, settings: Settings) -> Sortie:
                 seconds[leg] += taken_s * length_m / whole_m
     legs = (replace(leg, seconds=each) for leg, each in zip(sortie.legs, seconds, strict=True))
     return replace(sortie, legs=tuple(legs))
+
+
+class Track(NamedTuple):
+    """Places of a sortie at even times, the way that each is on, and what of it which leg is.
+
+    `parts` are (way, leg, from_m, to_m), of the lines alone.
+    """
+
+    step_s: float
+    places: Floats
+    way: Ints
+    parts: tuple[tuple[int, int, float, float], ...]
+    ends: Floats
+
+
+def track_of(sortie: Sortie, settings: Settings, step_s: float) -> Track:
+    """Return how a sortie is flown: where two ways overlap in time, both move the aircraft."""
+    sprays = [leg.kind == "spray" for leg in sortie.legs]
+    ways = _ways_without_runs(_ways(sortie, settings.height_m)[:-1], sprays)
+    bends_deg = [_bend_deg(before, after) for before, after in pairwise(ways)]
+    legs, overlaps_s = overlapping(
+        [way.length_m for way in ways], bends_deg, [_course(way, settings) for way in ways]
+    )
+    seconds = np.array([leg.seconds for leg in legs])
+    start_s = np.cumsum([0.0, *(seconds[:-1] - overlaps_s)])
+    # The next way is flown from the middle of what both have together.
+    turns_s = np.array([*(start_s[1:] + np.array(overlaps_s) / 2.0), start_s[-1] + seconds[-1]])
+    at_s = np.arange(0.0, turns_s[-1], step_s)
+    way_of = np.searchsorted(turns_s, at_s, side="right")
+    ends = np.array([(*way.start, *way.end) for way in ways])
+    unit = (ends[:, 2:] - ends[:, :2]) / np.array([[way.length_m] for way in ways])
+    places = ends[way_of, :2].copy()
+    for number, leg in enumerate(legs):
+        for other in (number - 1, number, number + 1):
+            mine = slice(*np.searchsorted(way_of, [other, other + 1]))
+            along_m = leg.way_m(at_s[mine] - start_s[number])
+            # Of the way before, what is still missing to its end.
+            along_m -= ways[number].length_m * (other > number)
+            places[mine] += along_m[:, None] * unit[number]
+    parts = []
+    for number, way in enumerate(ways):
+        to_m = np.cumsum([length_m for _, length_m in way.legs])
+        parts += [
+            (number, leg, float(end_m - length_m), float(end_m))
+            for (leg, length_m), end_m in zip(way.legs, to_m, strict=True)
+            if sprays[leg]
+        ]
+    return Track(step_s, places, way_of, tuple(parts), ends)
 
 
 def _course(way: _Stretch, settings: Settings) -> Course:

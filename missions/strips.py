@@ -77,6 +77,14 @@ def whole(strips: Objects) -> BaseGeometry:
     return shapely.union_all(strips, grid_size=GRID_M)
 
 
+def sprayed_twice(strips: Objects) -> BaseGeometry:
+    """Return the ground that lies under more than one strip."""
+    tree = shapely.STRtree(strips)
+    one, other = tree.query(strips, predicate="intersects")
+    keep = one < other
+    return whole(shapely.intersection(strips[one[keep]], strips[other[keep]], grid_size=GRID_M))
+
+
 def reach_inside(
     starts: Floats, along: Floats, wanted_m: Floats, ground: BaseGeometry, width_m: float
 ) -> Floats:

@@ -33,6 +33,8 @@ from missions.terrain import Terrain
 
 # Less room is not worth a waypoint: half a metre a second is reached on it.
 ROOM_MIN_M = 0.5
+# Ways outside the field go no farther from it, where they are allowed.
+OVERRUN_M = 500.0
 TOUCH_M = 1e-6
 # A pass that begins at so much of its speed is not worth a word.
 NEARLY = 0.95
