@@ -58,9 +58,12 @@ def test_the_papers_field_is_planned_with_its_map(
     assert code == 0
     assert {
         "coverage_percent", "overlap_percent", "outside_m2", "swaths", "turns", "spray_m",
-        "total_m", "flight_s", "planning_s", "volume_l", "sorties",
+        "total_m", "flight_s", "planning_s", "volume_l", "sorties", "treated_percent", "bare_m2",
+        "twice_m2",
     } <= set(found)  # fmt: skip
-    assert found["coverage_percent"] > 99.9
+    # Outer valves stay open 0.2 m from the border.
+    assert found["coverage_percent"] > 99.6
+    assert 90.0 < found["treated_percent"] < found["coverage_percent"]
     assert found["outside_m2"] == 0.0
     assert found["swaths"] == 5
     assert found["files"] == [str(out)]
@@ -158,7 +161,8 @@ def test_too_low_a_rate_is_flown_faster_only_where_that_is_allowed(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     words = [ANYANG / "boundary.geojson", "--config", ANYANG / "config.toml", "--speed-m-s", "2",
-             "--rate-l-ha", "5", *NAMED, "--out", tmp_path / "m.plan"]  # fmt: skip
+             "--rate-l-ha", "5", "--border-m", "0", *NAMED,
+             "--out", tmp_path / "m.plan"]  # fmt: skip
     _, found, _ = run(capsys, *words)
     assert "(--speed-max-m-s)" in found["warnings"][0]
     assert found["sorties"][0]["speeds_m_s"] == [2.0, 2.0]

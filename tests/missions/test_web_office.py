@@ -90,8 +90,8 @@ async def test_a_field_is_loaded_checked_planned_and_its_files_downloaded(site: 
     assert plan["error"] is None
     found = plan["found"]
     assert len(found["sorties"]) >= 2
-    # The sum over the map, by a tenth more at most: places that are covered twice.
-    assert 1.0 <= found["volume_l"] / checked["check"]["found"]["litres"] <= 1.1
+    # The sum over the map, by a fifth more at most: places that are covered twice.
+    assert 1.0 <= found["volume_l"] / checked["check"]["found"]["litres"] <= 1.2
     assert sum(one["volume_l"] for one in found["sorties"]) == pytest.approx(found["volume_l"])
     assert all(one["fill_l"] <= 4.0 for one in found["sorties"])
     assert plan["flight_map"]["error"] is None

@@ -149,7 +149,7 @@ function showPlan() {
   if (!plan) { box.replaceChildren(); return; }
   if (plan.error) { box.replaceChildren(refused(plan.error)); return; }
   const found = plan.found, parts = [
-    make("p", `${found.sorties.length} ${found.sorties.length === 1 ? "sortie" : "sorties"}, ${withUnit("volume", found.volume_l)}, ${(found.sorties.reduce((sum, each) => sum + each.airborne_s, 0) / 60).toFixed(0)} min in the air; ${found.coverage_percent.toFixed(1)} % covered, ${found.overlap_percent.toFixed(1)} % twice.`),
+    make("p", `${found.sorties.length} ${found.sorties.length === 1 ? "sortie" : "sorties"}, ${withUnit("volume", found.volume_l)}, ${(found.sorties.reduce((sum, each) => sum + each.airborne_s, 0) / 60).toFixed(0)} min in the air; ${found.treated_percent === null ? `${found.coverage_percent.toFixed(1)} % covered` : `${found.treated_percent.toFixed(1)} % treated, ${withUnit("area", found.bare_m2 / 1e4)} bare`}.`),
     sortieTable(found), ...mixParts(found.mix), ...found.warnings.map((text) => make("p", text, "refused")),
   ];
   if (plan.flight_map?.error) parts.push(refused(`flight map: ${plan.flight_map.error}`));
