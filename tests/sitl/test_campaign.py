@@ -445,6 +445,7 @@ def test_sensitivity_finds_the_setting_that_matters(
         read_rows(reference, []),
         campaign=campaign,
         point=np.arange(count),
+        seed=np.zeros(count, dtype=np.int64),
         figures={"misapplied_percent": 4.0 * campaign.points[:, 0]},
     )
     found = {(each.setting, each.name): each for each in sensitivity_of(rows)}
@@ -470,6 +471,7 @@ def test_too_few_samples_give_no_interval_and_say_so(
         read_rows(reference, []),
         campaign=campaign,
         point=np.arange(campaign.settings_count),
+        seed=np.zeros(campaign.settings_count, dtype=np.int64),
         figures={"misapplied_percent": 4.0 * campaign.points[:, 0]},
     )
     found = sensitivity_of(rows)
