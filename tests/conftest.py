@@ -163,8 +163,10 @@ def _children() -> set[int]:
         os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
     except ChildProcessError:
         return set()  # the usual case, and the quick one
-    lists = Path("/proc/self/task").glob("*/children")
-    children = {int(pid) for one in lists for pid in one.read_text().split()}
+    children: set[int] = set()
+    for one in Path("/proc/self/task").glob("*/children"):
+        with suppress(FileNotFoundError, ProcessLookupError):  # a thread that has just ended
+            children.update(map(int, one.read_text().split()))
     # Python's own helper of shared memory lives as long as we do.
     tracker = multiprocessing.resource_tracker._resource_tracker._pid  # type: ignore[attr-defined]
     return children - {tracker}

@@ -335,7 +335,7 @@ def test_a_fence_without_room_for_the_whole_field_holds_the_ground_beside_the_wa
     content = json.loads(plan_text(plan, plan.sorties[0], fences=fences))
     room = FENCE_CORNERS_MAX["ardupilot"]
     assert not judge_fence(drawn, content, corners_max=room, outside_max_m=10.0)
-    assert "6 m beside the way" in " ".join(fence_warnings(plan, fences))
+    assert "20 m beside the way" in " ".join(fence_warnings(plan, fences))
 
 
 def test_a_border_for_which_the_autopilot_has_no_room_is_refused() -> None:

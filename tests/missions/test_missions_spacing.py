@@ -50,8 +50,9 @@ def spacing_of(
     ground: shapely.Geometry, *, settings: Settings = SETTINGS, apart: bool = False
 ) -> Spacing:
     field = build_field(
-        to_degrees(ground), swath_width_m=min(6.0, settings.swath_width_m), frame=FRAME
-    )
+        to_degrees(ground), swath_width_m=min(6.0, settings.swath_width_m), frame=FRAME,
+        over_holes=True,
+    )  # fmt: skip
     return Spacing(
         ways=build_ways(field, np.array([[0.0, 0.0]])), settings=settings, apart=apart
     )  # fmt: skip

@@ -116,7 +116,7 @@ def test_slopes_are_flown_as_slowly_as_climb_and_descent_allow() -> None:
     terrain = Terrain(dem=dem_of(ramp, cell_m=1.0), frame=FRAME, climb_m_s=2.0)
     plan = plan_over(terrain)
     checked = 0
-    for leg in plan.sorties[0].legs:
+    for leg in (leg for sortie in plan.sorties for leg in sortie.legs):
         profile = terrain.profile(leg.points)
         slope = np.diff(profile.ground_m) / np.maximum(np.diff(profile.at_m), 1e-9)
         if leg.kind != "spray" or leg.length_m < 20.0 or abs(slope).max() < 0.39:

@@ -247,7 +247,7 @@ def test_by_a_map_a_product_follows_the_rates_and_its_average_is_the_dose(
     assert alpha["per_l"] == pytest.approx(0.5 / 20.0, rel=2e-3)
     assert alpha["sprayed"] == pytest.approx(0.6, rel=5e-3)
     assert (alpha["per_ha_min"], alpha["per_ha_max"]) == pytest.approx((0.25, 0.75), rel=5e-3)
-    assert any("Alpha <EC>: a hectare gets 249.9 mL to 749.6 mL" in note for note in mix["notes"])
+    assert any("Alpha <EC>: a hectare gets 249.8 mL to 749.4 mL" in note for note in mix["notes"])
     # The label's rate as the most that a hectare gets.
     held = configured(tmp_path, MISSION, MIX.replace('"mL/ha"', '"mL/ha"\nat_l_ha = 30'))
     mix = planned(capsys, field, "--config", held, *words, "--out", tmp_path / "m.kml")["mix"]
