@@ -15,6 +15,7 @@ from companion.errors import ConfigError
 from companion.journal.journal import Journal
 from companion.simulated import SIMULATED, Simulated
 from companion.wording import missing
+from missions.maps.compiling import MapOrder, job_of
 from sitl.deposit import Deposit
 
 if TYPE_CHECKING:
@@ -103,6 +104,7 @@ def write_journal(flown: Flown, folder: Path) -> Path:
         setup=flown.task.setup,
         setup_text={
             "config_toml": flown.task.config.source_text,
+            **job_of(MapOrder.of(flown.task.config)),
             **({} if flown.task.config.label is None else flown.task.config.label.as_meta()),
         },
         started_s=float(flown.trajectory.time_s[0]),

@@ -39,7 +39,7 @@ class Sortie:
         try:
             return str(json.loads(self.meta["flight_map_json"])["frozen"][JOB_KEY])
         except (ValueError, TypeError, LookupError, RecursionError):
-            return None
+            return self.meta.get(JOB_KEY)  # of a simulated flight, which freezes no map
 
     @property
     def began_s(self) -> float:

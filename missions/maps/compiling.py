@@ -206,7 +206,7 @@ def compile_map(
             area if area.is_valid else (make_valid(area) or MultiPolygon()) for area in local
         ),
         polylines=_polylines(order, frame, prescription),
-        frozen=frozen_settings(table, order.lines, order.buffers) | _job(order),
+        frozen=frozen_settings(table, order.lines, order.buffers) | job_of(order),
         sources=sources_of(order.files()),
         findings=tuple(findings),
     )
@@ -271,7 +271,7 @@ def _polylines(order: MapOrder, frame: LocalFrame, ground: Prescription) -> tupl
     return polylines
 
 
-def _job(order: MapOrder) -> dict[str, object]:
+def job_of(order: MapOrder) -> dict[str, str]:
     """Return the id of the job that the lines were planned for, as a setting of the flight map."""
     found = None if order.lines is None else _document(order.resolve(order.lines)).get("job")
     return {JOB_KEY: found} if isinstance(found, str) and _JOB.fullmatch(found) else {}

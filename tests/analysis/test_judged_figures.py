@@ -23,6 +23,7 @@ from analysis.exports.cli import export
 from analysis.exports.output import ExportError
 from analysis.exports.source import Source
 from analysis.flown.read_applied import read_applied
+from analysis.journals.jobs import sortie_of
 from analysis.report.build import Report, ReportOptions, build_report
 from analysis.report.job import build_job
 from companion.cli.app import execute
@@ -328,6 +329,11 @@ def job(tmp_path_factory: pytest.TempPathFactory) -> Job:
         # In any order.
         report=build_job(journals[::-1], ReportOptions(with_figures=False)),
     )
+
+
+def test_simulated_sorties_have_the_id_of_their_plan(job: Job) -> None:
+    (found,) = {sortie_of(path).job for path in job.journals}
+    assert found
 
 
 def test_the_ground_of_a_job_is_what_the_truth_says(job: Job) -> None:
