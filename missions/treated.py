@@ -42,7 +42,10 @@ STRAIGHT_M = 0.01
 
 def treated_by(plan: Plan, rates: Rates) -> Treated:
     """Return what the sorties treat; each knows of treated ground what itself has sprayed."""
-    settings, limit = plan.settings, plan.field.limit
+    settings, field = plan.settings, plan.field
+    # What lies beside a hole has a rate, and stays bare.
+    beside = field.outline.intersection(dict(field.closed).get("hole", shapely.Point()))
+    limit = shapely.union(field.limit, beside)
     rule = _Rule(
         settings=settings,
         rates=rates,
@@ -50,7 +53,7 @@ def treated_by(plan: Plan, rates: Rates) -> Treated:
         extents=None
         if settings.border_buffer_m is None
         else extents_of(
-            plan.field.kept_in,
+            field.kept_in,
             width_m=settings.swath_width_m,
             buffer_m=settings.border_buffer_m,
         ),

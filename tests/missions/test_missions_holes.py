@@ -93,6 +93,10 @@ def test_a_plan_says_what_its_holes_leave_bare(
     assert found["holes"]["bare_m2"] == pytest.approx(ring_m2, rel=0.01)
     # What stays bare is no part of what the passes reach.
     assert 1e4 * found["area_ha"] == pytest.approx(FIELD.area - ring_m2, rel=1e-3)
+    # But it is ground of the field, and a grower finds it bare.
+    assert found["bare_m2"] > 0.95 * ring_m2
+    rated_m2 = found["bare_m2"] / (1.0 - found["treated_percent"] / 100.0)
+    assert rated_m2 == pytest.approx(FIELD.area, rel=2e-3)
     _, lines = planned(capsys, field, "--out", out)
     (said,) = [line for line in lines if line.startswith("holes")]
     assert f"{found['holes']['bare_m2']:.0f} m2" in said and "--holes over" in said
