@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -268,7 +268,7 @@ def _accuracy(
             rate_l_ha=None if rate is None or math.isnan(rate) else rate,
             speed_low_m_s=None if place is None else (place - 0.5) * SPEED_BIN_M_S,
             speed_high_m_s=None if place is None else (place + 0.5) * SPEED_BIN_M_S,
-            percent=mean_interval(values, cluster[its]) if len(values) else NOTHING,
+            percent=_at_most_100(mean_interval(values, cluster[its])) if len(values) else NOTHING,
         )
 
     places = [float(place) for place in np.unique(bins)]
@@ -279,6 +279,11 @@ def _accuracy(
         tuple(each for each in both if each.percent.count),
         found.undefined,
     )
+
+
+def _at_most_100(found: Interval) -> Interval:
+    """Return an interval of an accuracy, which no flight can have above 100 %."""
+    return found if found.high is None else replace(found, high=min(found.high, 100.0))
 
 
 def ways_between(evaluation: Evaluation, time_s: Floats) -> np.ndarray[Any, np.dtype[np.int64]]:
