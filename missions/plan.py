@@ -244,11 +244,12 @@ def flown_lines(sorties: Sequence[Sortie]) -> Floats:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Treated:
-    """What the flight leaves `bare` of the ground that has a rate, and what it treats `twice`."""
+    """What the flight leaves `bare` of the ground with a rate, treats `twice`, and puts out."""
 
     ground_m2: float
     bare: BaseGeometry
     twice: BaseGeometry
+    volume_l: float
 
     @property
     def percent(self) -> float:
@@ -261,6 +262,7 @@ class Treated:
             "treated_percent": self.percent,
             "bare_m2": float(self.bare.area),
             "twice_m2": float(self.twice.area),
+            "treated_l": self.volume_l,
         }
 
 
@@ -351,7 +353,7 @@ class Plan:
             "largest_skip_m2": self.coverage.largest_skip_m2,
             "simpler_border_m2": self.field.given_up_m2,
             **(
-                dict.fromkeys(("treated_percent", "bare_m2", "twice_m2"))
+                dict.fromkeys(("treated_percent", "bare_m2", "twice_m2", "treated_l"))
                 if self.treated is None
                 else self.treated.summary()
             ),

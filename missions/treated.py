@@ -60,12 +60,17 @@ def treated_by(plan: Plan, rates: Rates) -> Treated:
     )
     total_s = max(plan.flight_s, 1.0)
     step_s = max(STEP_S, total_s / STEPS_MAX)
-    shapes = [shape for sortie in plan.sorties for shape in rule.swept(sortie, step_s)]
-    strips = np.array(shapes, dtype=object)
+    swept = [rule.swept(sortie, step_s) for sortie in plan.sorties]
+    strips = np.array([shape for shapes, _ in swept for shape in shapes], dtype=object)
     treated = whole(strips)
     bare = _rated(shapely.difference(limit, treated), rates)
     ground_m2 = float(bare.area + treated.intersection(limit).area)
-    return Treated(ground_m2=ground_m2, bare=bare, twice=sprayed_twice(strips))
+    return Treated(
+        ground_m2=ground_m2,
+        bare=bare,
+        twice=sprayed_twice(strips),
+        volume_l=sum(volume_l for _, volume_l in swept),
+    )
 
 
 def _rated(bare: BaseGeometry, rates: Rates) -> BaseGeometry:
@@ -94,12 +99,13 @@ class _Rule:
     valves: Floats
     extents: Extents | None
 
-    def swept(self, sortie: Sortie, step_s: float) -> list[BaseGeometry]:
-        """Return the ground of each time that valves side by side are open."""
+    def swept(self, sortie: Sortie, step_s: float) -> tuple[list[BaseGeometry], float]:
+        """Return the ground of each time that valves side by side are open, and all litres."""
         track = track_of(sortie, self.settings, step_s)
         nose = _nose(track, self.settings)
         velocity = np.gradient(track.places, step_s, axis=0)
         found: list[BaseGeometry] = []
+        volume_l = 0.0
         for way, _, from_m, to_m in track.parts:
             mine = np.flatnonzero(track.way == way)
             if len(mine) < 2:
@@ -107,11 +113,13 @@ class _Rule:
             passed = _Pass(
                 track=track, at=mine, velocity=velocity, nose=nose, from_m=from_m, to_m=to_m
             )
-            found += passed.strips(self.open(passed, found), self.valves)
-        return found
+            is_open, flow_l_min = self.open(passed, found)
+            found += passed.strips(is_open, self.valves)
+            volume_l += float(flow_l_min[is_open].sum()) * step_s / 60.0
+        return found, volume_l
 
-    def open(self, passed: _Pass, done: list[BaseGeometry]) -> Bools:
-        """Return at which places of a pass each valve is open."""
+    def open(self, passed: _Pass, done: list[BaseGeometry]) -> tuple[Bools, Floats]:
+        """Return at which places of a pass each valve is open, and the flow asked of it."""
         settings, (right_m, width_m) = self.settings, self.valves.T
         swept_m_s = passed.ahead_m_s[:, None] - passed.yaw[:, None] * right_m
         middle = passed.places[:, None] + passed.right[:, None] * right_m[:, None]
@@ -133,7 +141,7 @@ class _Rule:
         if settings.switch_off_percent is not None:
             share = self._treated(passed, done)
             found &= ~(share >= settings.switch_off_percent / 100.0 - 1e-9)
-        return found
+        return found, flow * width_m / settings.swath_width_m
 
     def _treated(self, passed: _Pass, done: list[BaseGeometry]) -> Floats:
         """Return how much of each valve's strip is treated at each place."""
@@ -275,7 +283,8 @@ def treated_lines(plan: Plan, rates: Rates, *, has_runs: bool) -> list[str]:
     lines = [
         f"treated   {said['treated_percent']:.1f} %: {said['bare_m2']:.0f} m2 stay bare "
         f"({under_m2:.0f} where a pass begins, ends or touches the border, "
-        f"{said['bare_m2'] - under_m2:.0f} beside the passes), {said['twice_m2']:.0f} m2 twice"
+        f"{said['bare_m2'] - under_m2:.0f} beside the passes), {said['twice_m2']:.0f} m2 twice, "
+        f"with {found.volume_l:.2f} L"
     ]
     if not has_runs and 100.0 * under_m2 > WORTH_PERCENT * found.ground_m2:
         other = _with_overrun(plan)

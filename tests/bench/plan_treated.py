@@ -112,6 +112,9 @@ def of_field(folder: Path, *options: str) -> dict[str, float]:
         "flown_bare_percent": true.bare_m2 * percent,
         "twice_percent": said["twice_m2"] * percent,
         "flown_twice_percent": true.twice_m2 * percent,
+        "litres": said["treated_l"],
+        "flown_litres": true.applied_l,
+        "planned_litres": said["volume_l"],
         "outside_ml": true.outside_ml,
     }
 

@@ -59,7 +59,7 @@ def test_the_papers_field_is_planned_with_its_map(
     assert {
         "coverage_percent", "overlap_percent", "outside_m2", "swaths", "turns", "spray_m",
         "total_m", "flight_s", "planning_s", "volume_l", "sorties", "treated_percent", "bare_m2",
-        "twice_m2",
+        "twice_m2", "treated_l",
     } <= set(found)  # fmt: skip
     # Outer valves stay open 0.2 m from the border.
     assert found["coverage_percent"] > 99.6

@@ -53,6 +53,8 @@ def test_the_tutorials_flight_leaves_what_its_plan_says(tmp_path: Path, overrun:
     found = of_field(tmp_path, "--angle-deg", "0", "--depot", "35.9959,114.5440")
     for what in ("bare", "twice"):
         assert found[f"{what}_percent"] == pytest.approx(found[f"flown_{what}_percent"], abs=1.0)
+    # What is put out follows from it, which the passes' own litres do not.
+    assert found["litres"] == pytest.approx(found["flown_litres"], rel=0.03)
     assert found["outside_ml"] == 0.0
     if overrun:
         assert found["flown_bare_percent"] < 5.0
