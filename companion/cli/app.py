@@ -293,7 +293,7 @@ def _executed(arguments: Sequence[str]) -> int:
     return result if isinstance(result, int) else 0
 
 
-# What the library says of an option that is no number, and how it is put here.
+# What the library says of a wrong option, and how it is put here.
 _PLAINLY = {
     "Input should be a valid number, unable to parse string as a number": (
         "write a number, with a point for decimals: 20.5"
@@ -301,6 +301,7 @@ _PLAINLY = {
     "Input should be a valid integer, unable to parse string as an integer": (
         "write a whole number, such as 2"
     ),
+    "Value error, ": "",
 }
 
 

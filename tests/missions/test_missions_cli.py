@@ -194,6 +194,11 @@ BOW_TIE = Polygon([(0, 0), (100, 100), (100, 0), (0, 100)])
         (box(0, 0, 100, 100), ["--rate-l-ha", "0"], "rate above zero"),
         (box(0, 0, 100, 100), ["--rate-l-ha", "nan"], "--rate-l-ha"),
         (box(0, 0, 100, 100), ["--rate-l-ha", "20,5"], "write a number, with a point for decimals"),
+        (
+            box(0, 0, 100, 100),
+            ["--holes", "through"],
+            "'--holes': 'through' is not one of 'around', 'over'",
+        ),
         (box(0, 0, 100, 100), ["--aircraft", "two"], "'--aircraft': write a whole number"),
         (box(0, 0, 100, 100), ["--depot", "11"], "write LAT,LON in degrees, the latitude first ("),
         (box(0, 0, 100, 100), ["--swath-m", "-6"], "--swath-m -6: write a number greater than"),
