@@ -25,7 +25,7 @@ COMPILE = $(BIN)/uv pip compile --universal --fork-strategy fewest --python-vers
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-computing test-flights test-companion test-missions test-analysis test-sitl lint format-check ruff mypy imports weight bench mutants mutants-safety faults test-gpio test-firmware arm-wheels test-image test-wheel wheel docs reference lock clean bench-missions bench-real
+.PHONY: help setup demo test test-computing test-flights test-companion test-missions test-analysis test-sitl lint format-check ruff mypy imports weight bench mutants mutants-safety faults test-gpio test-firmware arm-wheels test-image test-wheel wheel docs reference lock clean bench-missions bench-real files
 
 help: ## what there is
 	@awk -F ':.*## ' '/^[a-z -]+:.*## /{printf "make %-15s %s\n", $$1, $$2}' Makefile
@@ -87,6 +87,9 @@ bench-real: $(INSTALLED) ## how exact on flights really flown: the logs in VRSPR
 bench-missions: export PYTHONDONTWRITEBYTECODE :=
 bench-missions: $(INSTALLED) ## plans for 226 outlines, judged apart, beside peers' (ARGS="--count 30 --fields DIR")
 	$(BIN)/python -m tests.bench.outlines $(if $(SEED),--seed $(SEED)) $(ARGS)
+
+files: $(INSTALLED) ## every rule of reading maps in every format, as others write it (ARGS=GeoPackage for some)
+	$(BIN)/python -m tests.file_kinds $(ARGS)
 
 mutants: $(INSTALLED) ## each known way to break the code makes a test fail (ARGS="lease" for some)
 	$(BIN)/python -m tests.mutations $(ARGS)
