@@ -17,6 +17,8 @@ from pyproj import CRS, Transformer
 from companion.core.frame import LocalFrame
 from missions.errors import PlanError
 from missions.field import Field
+from missions.maps.bundle import files_beside
+from missions.maps.geotiff_bands import BYTE_FILL
 from missions.maps.geotiff_file import read_raster
 from missions.maps.model import read_bytes
 from missions.strips import Floats
@@ -156,12 +158,15 @@ def _hgt(path: Path) -> Dem:
 
 def _geotiff(path: Path) -> Dem:
     # "Described": a byte raster of heights is no picture to be refused here.
-    raster = read_raster(read_bytes(path), path, layer=None, described=True)
+    raster = read_raster(files_beside(path), path.name, layer=None, described=True)
     if len(raster.bands) != 1:
         raise PlanError(f"{path}: an elevation model has one band, not {len(raster.bands)}")
-    if raster.crs is None or raster.transform is None:
+    if raster.crs is None:
         raise PlanError(f"{path}: it does not say where it lies; export it with its CRS")
     band = raster.bands[0].band
+    for one in raster.bands[0].problems:
+        if one.code == BYTE_FILL:
+            raise PlanError(f"{path}: {one.text}; {one.fix}")
     unit = (band.unit or raster.unit or "m").strip().casefold()
     if unit not in UNITS_M:
         raise PlanError(f"{path}: heights in {unit!r:.40} are not known; export them in metres")

@@ -153,6 +153,8 @@ def _map_of_grid(
     """Return the map that rows and columns of cells hold."""
     used_crs, crs_problems = crs_of(found, path, crs)
     choice = choose(found.bands, asked=rate_field, path=path)
+    if choice.column.fault is not None:
+        raise choice.column.fault
     unit = unit_of(found, choice.column, given=given, path=path)
     rates = choice.column.values * unit.l_ha
     with np.errstate(invalid="ignore"):

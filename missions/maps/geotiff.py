@@ -32,15 +32,11 @@ from missions.maps.dbf import find_shapefile
 from missions.maps.geotiff_bands import (
     ReadBand,
     class_problem,
-    difference,
-    parse_world_file,
     usable,
-    world_file_of,
 )
 from missions.maps.geotiff_file import Raster, gdal, read_raster
 from missions.maps.local import outline_of
 from missions.maps.model import (
-    Affine,
     Band,
     Grid,
     MapCells,
@@ -69,34 +65,21 @@ def read_geotiff(path: Path, layer: str | None = None) -> Grid:
 
 def read_bands(path: Path, layer: str | None = None) -> Grid:
     """Return the bands of a GeoTIFF as measurements, which are not rates and may be negative."""
-    bundle = files_beside(path)
-    content = bundle.read(path.name)
-    raster = read_raster(content, path, layer=layer, described=False, colours=True)
-    if not raster.bands:
-        raise map_error(
-            path, "it has no band of values", fix="export the raster again", code="no-rate-column"
-        )
+    raster = read_raster(files_beside(path), path.name, layer=layer, described=False, colours=True)
     for one in raster.bands:
         values = one.band.values
-        if one.fault is None or one.fault.code != "nodata-undeclared":
+        if one.band.fault is None or one.band.fault.code != "nodata-undeclared":
             continue
         # A fill is far from all measurements; a single negative index is one.
         if not float(np.nanmin(values)) >= -FILL_LEAST or float(np.nanmax(values)) > FILL_MOST:
-            raise one.fault
-    rows, columns = raster.bands[0].band.values.shape
-    name = world_file_of(bundle, path.name)
-    world = None
-    if name is not None:
-        alone = raster.transform is None
-        world = parse_world_file(bundle.read(name), bundle.path / name, alone=alone)
-    transform, moved = _placed(raster, world, (rows, columns), path)
+            raise one.band.fault
     return Grid(
         format="geotiff",
         crs=raster.crs,
-        transform=transform,
+        transform=raster.transform,
         bands=_told_apart([one.band for one in raster.bands]),
-        sha256=digest([content]),
-        problems=(*moved, *(problem for one in raster.bands for problem in one.problems)),
+        sha256=digest(raster.files[one] for one in sorted(raster.files)),
+        problems=(*raster.problems, *(problem for one in raster.bands for problem in one.problems)),
     )
 
 
@@ -110,50 +93,18 @@ def grid_of_tiff(
     also: dict[str, bytes] | None = None,
 ) -> Grid:
     """Return the GeoTIFF `name` of a bundle; `also` are files of the map that others have read."""
-    path = bundle.path / name
-    content = bundle.read(name)
-    files = {**(also or {}), name: content}
-    raster = read_raster(content, path, layer=layer, described=operation is not None)
-    if not raster.bands:
-        raise map_error(
-            path, "it has no band of values", fix="export the map again", code="no-rate-column"
-        )
-    shape = raster.bands[0].band.values.shape
-    world_name = world_file_of(bundle, name)
-    world = None
-    if world_name is not None:
-        files[world_name] = bundle.read(world_name)
-        world = parse_world_file(
-            files[world_name], bundle.path / world_name, alone=raster.transform is None
-        )
-    transform, moved = _placed(raster, world, (shape[0], shape[1]), path)
-    bands, said = _bands(raster, operation, path)
+    raster = read_raster(bundle, name, layer=layer, described=operation is not None)
+    files = {**(also or {}), **raster.files}
+    bands, said = _bands(raster, operation, bundle.path / name)
     return Grid(
         format=format,
         crs=raster.crs,
-        transform=transform,
+        transform=raster.transform,
         bands=bands,
         sha256=digest(files[one] for one in sorted(files)),
         unit=raster.unit,
-        problems=(*moved, *said),
+        problems=(*raster.problems, *said),
     )
-
-
-def _placed(
-    raster: Raster, world: Affine | None, shape: tuple[int, int], path: Path
-) -> tuple[Affine, list[Problem]]:
-    """Return where the cells lie: by the file itself, else by its world file."""
-    if raster.transform is None and world is None:
-        raise map_error(
-            path,
-            "it does not say where it lies",
-            fix="export it as GeoTIFF, or copy its .tfw beside it",
-            code="not-georeferenced",
-        )
-    if raster.transform is None or world is None:
-        return raster.transform or world or (1.0, 0.0, 0.0, 0.0, 1.0, 0.0), []
-    problem = difference(raster.transform, world, shape, raster.crs, path)
-    return raster.transform, [problem] if problem is not None else []
 
 
 def _bands(

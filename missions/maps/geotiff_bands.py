@@ -30,8 +30,11 @@ Bools = NDArray[np.bool_]
 _CLASSES_MAX = 9
 # No rate of anything, in any unit; programs fill with the largest number of a type.
 _FILL_MIN = 1e30
-# Types whose largest number is a fill. That of a byte, 255, may be a rate.
+# Types whose largest number is a fill. That of a byte, 255, may be a rate: it is none at the edge
+# of the map and twice as large as all others.
 _FILLED = ("int16", "uint16", "int32", "uint32", "int64", "uint64")
+_BYTES, _FAR_TIMES = ("uint8", "int8"), 2.0
+BYTE_FILL = "nodata-byte"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,11 +52,10 @@ class RawBand:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReadBand:
-    """One band understood: what to say of it, and why it can be no rate, if so."""
+    """One band understood, and what to say of it."""
 
     band: Band
     problems: tuple[Problem, ...] = ()
-    fault: MapError | None = None
 
 
 def read_band(raw: RawBand, path: Path) -> ReadBand:
@@ -75,17 +77,22 @@ def _read_band(raw: RawBand, path: Path) -> ReadBand:
         if raw.nodata == 0.0 and count:
             problems.append(_nodata_zero(raw.name, count))
         missing |= empty
-    filled = _filled(raw, missing)
+    filled, byte = _filled(raw, missing), _byte(raw, missing)
+    if byte is not None:
+        problems.append(byte)
+        edge = raw.values[[0, -1]].tolist(), raw.values[:, [0, -1]].tolist()
+        largest = np.iinfo(raw.values.dtype).max
+        filled = float(largest) if any(largest in row for side in edge for row in side) else None
     if (raw.scale, raw.offset) != (1.0, 0.0):
         if not (0.0 < abs(raw.scale) < 1e9 and abs(raw.offset) < 1e9):
             text = f"{raw.name} is to be multiplied by {raw.scale:g} with {raw.offset:g} added"
             raise map_error(path, text, fix="export the map again", code="bad-rate")
         values = values * raw.scale + raw.offset
     values[missing] = np.nan
+    fault = filled_fault(raw, filled, path) if filled else _fault(raw, values, path)
     return ReadBand(
-        band=Band(name=raw.name, values=values, unit=raw.unit),
+        band=Band(name=raw.name, values=values, unit=raw.unit, fault=fault),
         problems=tuple(problems),
-        fault=filled_fault(raw, filled, path) if filled else _fault(raw, values, path),
     )
 
 
@@ -94,7 +101,7 @@ def usable(bands: Sequence[ReadBand]) -> tuple[Band, ...]:
 
     One among several that can is not in the way: NDVI is below zero, and nobody sprays by it.
     """
-    faults = [one.fault for one in bands if one.fault is not None]
+    faults = [one.band.fault for one in bands if one.band.fault is not None]
     if faults and len(faults) == len(bands):
         raise faults[0]
     return tuple(one.band for one in bands)
@@ -151,13 +158,33 @@ def _filled(raw: RawBand, missing: Bools) -> float | None:
     return None
 
 
+def _byte(raw: RawBand, missing: Bools) -> Problem | None:
+    """Return what to say of the largest number of a byte, far from all others."""
+    there = raw.values[~missing]
+    if raw.values.dtype.name not in _BYTES or not there.size:
+        return None
+    largest = np.iinfo(raw.values.dtype).max
+    others = there[there != largest]
+    if others.size in (0, there.size) or float(others.max()) * _FAR_TIMES > largest:
+        return None
+    return Problem(
+        severity="warning",
+        code=BYTE_FILL,
+        text=f"{there.size - others.size} cells hold {largest}, the largest number of a byte, and "
+        f"all others at most {others.max()}: it may stand for no data",
+        where=raw.name,
+        fix=f"export the map with {largest} declared as no data, or as numbers of 16 bits",
+    )
+
+
 def filled_fault(raw: RawBand, value: float, path: Path) -> MapError:
     """Return the refusal of a number that stands for no data, which the file does not say."""
     beside = "" if raw.nodata is None else f" beside its no-data value {raw.nodata:.6g}"
     return map_error(
         path,
         f"{raw.name} holds {value:.6g}{beside}, which is not a rate and not declared as no data",
-        fix=f"export the map again with {value:.6g} declared as its no-data value",
+        fix=f"export the map again with {value:.6g} declared as its no-data value"
+        + (", or as numbers of 16 bits" if raw.values.dtype.name in _BYTES else ""),
         code="nodata-undeclared",
     )
 
@@ -195,17 +222,17 @@ _HALF, _OTHER_PLACE_CELLS = 0.5, 1.0
 
 def world_file_of(bundle: Bundle, name: str) -> str | None:
     """Return the name of the world file that lies beside a picture, or None."""
-    picture = PurePosixPath(name)
-    found = [
-        other
-        for other in bundle.with_suffix(*SUFFIXES)
-        if PurePosixPath(other).parent == picture.parent
-        and PurePosixPath(other).stem.casefold() == picture.stem.casefold()
-    ]
+    return beside(bundle, name, *(str(PurePosixPath(name).with_suffix(end)) for end in SUFFIXES))
+
+
+def beside(bundle: Bundle, name: str, *wanted: str) -> str | None:
+    """Return which of these names, in any case, a bundle holds; two of them are refused."""
+    folded = [one.casefold() for one in wanted]
+    found = [other for other in bundle.names if other.casefold() in folded]
     if len(found) > 1:
         raise map_error(
             bundle.path,
-            f"{found[0]} and {found[1]} both say where {picture.name} lies",
+            f"{found[0]} and {found[1]} both say of {PurePosixPath(name).name} what it is",
             fix="remove the wrong one",
             code="several-files",
         )

@@ -1,7 +1,8 @@
 """The bytes of a GeoTIFF, taken apart by GDAL (rasterio) within bounds.
 
-GDAL is given the bytes and nothing else: it opens no other file, format or address, and what it
-would allocate is known from the head of the file before any cell is read.
+GDAL is given the bytes and those of the files beside it, and nothing else: it opens no other file,
+format or address, and what it would allocate is known from the head of the file before any cell is
+read.
 """
 
 from __future__ import annotations
@@ -9,31 +10,40 @@ from __future__ import annotations
 import re
 import struct
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
+from xml.etree.ElementTree import tostring
 
 from pyproj import CRS
 
 from companion.errors import MapError
 from companion.wording import lack_of
-from missions.maps.bundle import parse_xml
+from missions.maps.bundle import Bundle, parse_xml
 from missions.maps.crs import parse_crs
-from missions.maps.geotiff_bands import RawBand, ReadBand, read_band
-from missions.maps.model import Affine, map_error
+from missions.maps.geotiff_bands import (
+    RawBand,
+    ReadBand,
+    beside,
+    difference,
+    parse_world_file,
+    read_band,
+    world_file_of,
+)
+from missions.maps.model import Affine, Problem, map_error
 
 MAX_CELLS = 16_000_000
 MAX_BANDS = 64
 MAX_VALUES = 64_000_000
 _MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _MAX_PAGES = 1_000
-# No file beside the map is looked for, and no world file: ours is read by other rules.
+# No world file: ours is read by other rules.
 _OPTIONS = {
-    "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
-    "GDAL_PAM_ENABLED": False,
-    "GDAL_GEOREF_SOURCES": "INTERNAL",
+    "GDAL_DISABLE_READDIR_ON_OPEN": True,
+    "GDAL_PAM_ENABLED": True,
+    "GDAL_GEOREF_SOURCES": "PAM,INTERNAL",
     "GDAL_CACHEMAX": 64,
     "GDAL_NUM_THREADS": "1",
 }
@@ -44,17 +54,27 @@ _COPY = re.compile(
     r"'?(?:GTIFF_DIR:\d+:)?(?:/vsimem/)?[0-9a-f-]{36}(?:/[^\s:']*)?(?:\.tif)?'?:?\s*"
 )
 
+# What a file beside the map (`rx.tif.aux.xml`) says of its numbers and its place. The rest is
+# statistics and names of other files, which GDAL would open.
+_AUX, _MASK, _IMAGINE = ".aux.xml", ".msk", ".aux"
+_AUX_NUMBERS = ("nodatavalue", "scale", "offset")
+_AUX_KEPT = (
+    *_AUX_NUMBERS, "unittype", "description", "colorinterp", "metadata", "pamrasterband", "srs",
+    "geotransform", "gcplist",
+)  # fmt: skip
 _NO_PIXELS = re.compile(r"IReadBlock|Read failed")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Raster:
-    """What a file says: `transform` from corners of cells, None where it does not say."""
+    """What a file and those beside it say: `transform` from corners of cells."""
 
     crs: CRS | None
-    transform: Affine | None
+    transform: Affine
     bands: tuple[ReadBand, ...]
     unit: str | None
+    files: dict[str, bytes]
+    problems: tuple[Problem, ...] = ()
 
 
 def gdal(path: Path) -> Any:
@@ -69,36 +89,114 @@ def gdal(path: Path) -> Any:
 
 
 def read_raster(
-    content: bytes, path: Path, *, layer: str | None, described: bool, colours: bool = False
+    bundle: Bundle, name: str, *, layer: str | None, described: bool, colours: bool = False
 ) -> Raster:
-    """Return all bands of a GeoTIFF; `described`: another file says what each of them is.
+    """Return all bands of the GeoTIFF `name`, with what the files beside it say, as GDAL does.
 
-    With `colours` they may be those of a camera: they are no rates then, but measurements.
+    Maps of rates, measurements and heights are all read here. `described`: another file says what
+    each band is. With `colours` they may be those of a camera: they are no rates then, but
+    measurements.
     """
+    path = bundle.path / name
+    files = {name: bundle.read(name)}
+    content = files[name]
     if not content.startswith(_MAGIC):
         raise map_error(
             path, "this is not a TIFF file", fix="export the map again as GeoTIFF",
             code="unknown-format",
         )  # fmt: skip
-    with _opened(content, path, layer) as source:
+    world_name, world = world_file_of(bundle, name), None
+    if world_name is not None:
+        files[world_name] = bundle.read(world_name)
+    sidecars = _sidecars(bundle, name, files)
+    with _opened(content, sidecars, path, layer) as source:
         _check_size(source, path)
         _check_numbers(source, path)
         if not described and not colours:
             _check_no_picture(source, path)
         crs, transform = _crs(source, path), _transform(source, path)
-        tags = {name.casefold(): text for name, text in source.tags().items()}
+        tags = {key.casefold(): text for key, text in source.tags().items()}
         alpha = set() if described else _alpha(source)
         bands = tuple(
             read_band(_raw_band(source, index, described=described), path)
             for index in source.indexes
             if index not in alpha
         )
-    unit = next((tags[name] for name in _UNIT_TAGS if tags.get(name)), None)
-    return Raster(crs=crs, transform=transform, bands=bands, unit=unit)
+        shape = source.shape
+    if not bands:
+        raise map_error(
+            path, "it has no band of values", fix="export the map again", code="no-rate-column"
+        )
+    if world_name is not None:
+        where = bundle.path / world_name
+        world = parse_world_file(files[world_name], where, alone=transform is None)
+    transform, problems = _placed(transform, world, shape, crs, path)
+    unit = next((tags[key] for key in _UNIT_TAGS if tags.get(key)), None)
+    return Raster(
+        crs=crs, transform=transform, bands=bands, unit=unit, files=files, problems=problems
+    )
+
+
+def _placed(
+    own: Affine | None, world: Affine | None, shape: tuple[int, int], crs: CRS | None, path: Path
+) -> tuple[Affine, tuple[Problem, ...]]:
+    """Return where the cells lie: by the file itself, else by its world file."""
+    if own is None and world is None:
+        raise map_error(
+            path,
+            "it does not say where it lies",
+            fix="export it as GeoTIFF, or copy its .tfw beside it",
+            code="not-georeferenced",
+        )
+    if own is None or world is None:
+        return own or world or _IDENTITY, ()
+    problem = difference(own, world, shape, crs, path)
+    return own, () if problem is None else (problem,)
+
+
+def _sidecars(bundle: Bundle, name: str, files: dict[str, bytes]) -> dict[str, bytes]:
+    """Return what GDAL is to find beside a GeoTIFF, by suffix, and add the files themselves."""
+    found = {}
+    for suffix in (_AUX, _MASK):
+        other = beside(bundle, name, f"{name}{suffix}")
+        if other is not None:
+            files[other] = found[suffix] = bundle.read(other)
+    if _AUX in found:
+        found[_AUX] = _aux(found[_AUX], bundle.path / f"{name}{_AUX}")
+    old = beside(bundle, name, f"{name}{_IMAGINE}", f"{name.rpartition('.')[0]}{_IMAGINE}")
+    if old is not None and bundle.read(old).startswith(b"EHFA_HEADER_TAG"):
+        raise map_error(
+            bundle.path / name,
+            f"{old} lies beside it, which may say what is no data and is not read",
+            fix="export the map again as one GeoTIFF, or remove that file",
+            code="file-beside",
+        )
+    return found
+
+
+def _aux(content: bytes, path: Path) -> bytes:
+    """Return what a file of GDAL's beside the map says of its numbers and its place."""
+    root = parse_xml(content, path)
+    for parent in (root, *[each for each in root if each.tag.casefold() == "pamrasterband"]):
+        for child in [*parent]:
+            tag = child.tag.casefold()
+            if tag not in _AUX_KEPT or child.get("domain"):
+                parent.remove(child)
+            if tag in _AUX_NUMBERS:
+                try:
+                    float(child.text or "")
+                except ValueError:
+                    raise map_error(
+                        path, f"its {child.tag} {(child.text or '')[:40]!r} is not a number",
+                        fix="export the map again", code="bad-rate",
+                    ) from None  # fmt: skip
+    return tostring(root)
 
 
 @contextmanager
-def _opened(content: bytes, path: Path, layer: str | None) -> Iterator[Any]:
+def _opened(
+    content: bytes, sidecars: dict[str, bytes], path: Path, layer: str | None
+) -> Iterator[Any]:
     rasterio = gdal(path)
     from rasterio._err import CPLE_BaseError
 
@@ -107,18 +205,32 @@ def _opened(content: bytes, path: Path, layer: str | None) -> Iterator[Any]:
          MemoryError, KeyError, AttributeError,
     )  # fmt: skip
     try:
-        for description in check_tags(content):
-            # GDAL does without one that it cannot read, and so without the scale of the rates.
-            parse_xml(description, path, name="its description of the bands")
-        with warnings.catch_warnings(), rasterio.Env(**_OPTIONS):
+        for part in (content, *(sidecars[each] for each in sidecars if each == _MASK)):
+            if not part.startswith(_MAGIC):
+                raise ValueError(f"its {_MASK} is not a TIFF file")
+            for description in check_tags(part):
+                # GDAL does without one that it cannot read, and so without the scale of the rates.
+                parse_xml(description, path, name="its description of the bands")
+        with ExitStack() as stack:
+            stack.enter_context(warnings.catch_warnings())
+            stack.enter_context(rasterio.Env(**_OPTIONS))
             warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-            with rasterio.io.MemoryFile(content) as memory, memory.open(driver="GTiff") as source:
-                page = _page(source.subdatasets, path, layer)
-                if page is None:
-                    yield source
-                else:
-                    with rasterio.open(page, driver="GTiff") as one:
-                        yield one
+            memory = stack.enter_context(rasterio.io.MemoryFile(content))
+            place = PurePosixPath(memory.name)
+            mask = None
+            for suffix, part in sidecars.items():
+                one = rasterio.io.MemoryFile(part, dirname=place.parent.name,
+                                             filename=f"{place.name}{suffix}")  # fmt: skip
+                stack.enter_context(one)
+                mask = one if suffix == _MASK else mask
+            source = stack.enter_context(memory.open(driver="GTiff"))
+            page = _page(source.subdatasets, path, layer)
+            if page is not None:
+                _check_alone(sidecars, path)
+                source = stack.enter_context(rasterio.open(page, driver="GTiff"))
+            if mask is not None:
+                _check_mask(stack.enter_context(mask.open(driver="GTiff")), source, path)
+            yield source
     except MapError:
         raise
     except broken as error:
@@ -131,6 +243,23 @@ def _opened(content: bytes, path: Path, layer: str | None) -> Iterator[Any]:
             fix="copy it again, or export the map again",
             code="truncated",
         ) from None
+
+
+def _check_alone(sidecars: Iterable[str], path: Path) -> None:
+    for suffix in sidecars:
+        raise map_error(
+            path, f"it holds several pictures, and {path.name}{suffix} does not say of which it is",
+            fix="export the picture that is meant as a GeoTIFF of its own", code="file-beside",
+        )  # fmt: skip
+
+
+def _check_mask(mask: Any, source: Any, path: Path) -> None:
+    if mask.shape != source.shape or mask.count not in (1, source.count):
+        raise map_error(
+            path, f"its mask {path.name}{_MASK} is not of as many rows, columns and bands",
+            fix="copy the files again, or export the map again", code="file-beside",
+        )  # fmt: skip
+    _check_size(mask, path)
 
 
 def _page(pages: list[str], path: Path, layer: str | None) -> str | None:
@@ -234,7 +363,9 @@ def _transform(source: Any, path: Path) -> Affine | None:
 def _raw_band(source: Any, index: int, *, described: bool) -> RawBand:
     at = index - 1
     flags = {flag.name for flag in source.mask_flag_enums[at]}
-    hides = "per_dataset" in flags and not (described and "alpha" in flags)
+    # A mask beside the file may be one for each band, and has no flag then.
+    hides = not flags & {"all_valid", "nodata", "alpha"} or "per_dataset" in flags
+    hides = hides and not (described and "alpha" in flags)
     tags = {name.casefold(): text for name, text in source.tags(index).items()}
     return RawBand(
         name=" ".join((source.descriptions[at] or "").split())[:60] or f"band {index}",

@@ -206,13 +206,17 @@ class Layer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Band:
-    """One value for every cell: (rows, columns), NaN for no data; the rest as for a `Column`."""
+    """One value for every cell: (rows, columns), NaN for no data; the rest as for a `Column`.
+
+    `fault` is why it can be no rate, where that is so.
+    """
 
     name: str
     values: NDArray[np.float64]
     unit: str | None = None
     is_rate: bool = False
     default: float | None = None
+    fault: MapError | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

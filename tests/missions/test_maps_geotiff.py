@@ -377,18 +377,6 @@ def test_control_points_alone_are_refused(tmp_path: Path) -> None:
     assert "control points" in refused("not-georeferenced", path)
 
 
-def test_files_beside_the_map_are_not_followed(tmp_path: Path) -> None:
-    path = write(tmp_path / "rx.tif")
-    Path(f"{path}.aux.xml").write_text(
-        "<PAMDataset><GeoTransform>1,1,0,1,0,-1</GeoTransform><PAMRasterBand band='1'>"
-        "<NoDataValue>20</NoDataValue></PAMRasterBand></PAMDataset>",
-        "utf-8",
-    )
-    grid = read_geotiff(path)
-    assert grid.transform == pytest.approx(PLACE[:6])
-    assert not np.isnan(grid.bands[0].values).any()
-
-
 # --- Bounds and damage ---
 
 
