@@ -33,6 +33,8 @@ Bools = NDArray[np.bool_]
 FIT_SIDE = 14
 FIT_MAX_M = 1e-7
 USABLE_MAX_M = 1e-3
+# Edges of cells this near to a line are straight.
+STRAIGHT_M = 0.01
 # Cells smaller than this are below what any receiver can tell apart.
 CELL_MIN_M = 0.05
 BLOCK_CELLS = 200_000
@@ -114,6 +116,28 @@ def grid_of(cells: MapCells, frame: LocalFrame, path: Path) -> CellGrid:
         kinds = kinds[::-1]
     to_frame, to_cells = _fitted(cells, frame, path, flipped=flipped)
     return CellGrid(kinds, rates, to_frame, to_cells)
+
+
+def cells_of(grid: CellGrid, frame: LocalFrame) -> MapCells | None:
+    """Return cells of a flight as a map has them, None where no CRS has their edges straight."""
+    rows, columns = grid.classes.shape
+    side = np.linspace(0.0, 1.0, FIT_SIDE)
+    column, row = (one.ravel() for one in np.meshgrid(columns * side, rows * side))
+    # Rows run south in most files, and north in a flight.
+    east, north = grid.to_frame(column, rows - row)
+    latitude, longitude = frame.to_geographic_all(east.tolist(), north.tolist())
+    matrix = np.column_stack([column, row, np.ones_like(row)])
+    for crs, unit_m, x, y in (
+        (frame.crs, 1.0, east, north),
+        (WGS84, METRES_PER_DEGREE, longitude, latitude),
+    ):
+        known = np.column_stack([x, y])
+        terms = np.linalg.lstsq(matrix, known, rcond=None)[0]
+        if unit_m * float(np.abs(matrix @ terms - known).max()) <= STRAIGHT_M:
+            rates = np.append(grid.rates_l_ha, np.nan)[grid.classes[::-1]]  # NO_RATE is the last
+            (a, d), (b, e), (c, f) = terms.tolist()
+            return MapCells(rates_l_ha=rates, transform=(a, b, c, d, e, f), crs=crs)
+    return None
 
 
 def to_cells_of(

@@ -26,6 +26,7 @@ from missions.maps.adapt import (
 )
 from missions.maps.assemble import crs_of, ground_of, map_of, zone_names
 from missions.maps.bundle import Bundle, open_bundle
+from missions.maps.cells import cells_of
 from missions.maps.crs import Floats, to_longitude_latitude
 from missions.maps.csvfile import read_csv
 from missions.maps.fields import Given
@@ -450,7 +451,7 @@ def _named(found: Sequence[_Candidate], layer: str) -> list[_Candidate]:
 
 
 def read_compiled(path: Path, factors: Mapping[str, float | None]) -> MapFile:
-    """Return a flight map in longitude and latitude; of cells, the ground of each rate.
+    """Return a flight map in longitude and latitude, cells as cells.
 
     Its rates are L/ha already, its boundary is without the exclusions. Factors on its rates are in
     it: others are refused.
@@ -465,12 +466,15 @@ def read_compiled(path: Path, factors: Mapping[str, float | None]) -> MapFile:
                 code="scaled-rates",
             )
     prescription = found.prescription
-    *areas, field = _degrees(
-        [*(zone.polygon for zone in prescription.zones), prescription.field], found.frame
-    )
+    grid = prescription.cells
+    cells = None if grid is None else cells_of(grid, found.frame)
+    sources = () if cells is not None else prescription.zones
+    # Cells that are their own border have no other.
+    border = [prescription.field] if found.is_bounded or cells is None else []
+    areas = _degrees([*(zone.polygon for zone in sources), *border], found.frame)
     zones = [
         MapZone(name=zone.name, geometry=area, rate_l_ha=zone.rate_l_ha)
-        for zone, area in zip(prescription.zones, areas, strict=True)
+        for zone, area in zip(sources, areas, strict=False)
         if not area.is_empty
     ]
     return MapFile(
@@ -481,7 +485,8 @@ def read_compiled(path: Path, factors: Mapping[str, float | None]) -> MapFile:
         rate_field="rate_l_ha",
         zones=tuple(zones),
         sha256=prescription.sha256,
-        boundary=MultiPolygon(polygons_of(field)),
+        cells=cells,
+        boundary=MultiPolygon(polygons_of(areas[-1])) if border else None,
         default_rate_l_ha=prescription.default_rate_l_ha,
     )
 

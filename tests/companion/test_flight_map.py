@@ -31,7 +31,8 @@ from companion.flight_map import (
 from companion.flight_map import child as child_module
 from companion.flight_map import file as file_module
 from companion.journal.geopackage import LOCAL_ID, geometry_blob
-from missions.maps.build import build_prescription, frame_for
+from missions.maps.build import build_prescription, frame_for, point_rates
+from missions.maps.cells import bounds_deg
 from missions.maps.compiling import (
     MapOrder,
     compile_map,
@@ -40,7 +41,7 @@ from missions.maps.compiling import (
     read_ordered_map,
     write_flight_map,
 )
-from missions.maps.model import MapCells, MapFile
+from missions.maps.model import Affine, MapCells, MapFile
 from missions.maps.registry import read_map
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -373,6 +374,46 @@ def test_cells_without_a_border_have_none_from_the_file_either(tmp_path: Path) -
         before.prescription.edges_near(-52, -47, 48, 53)[0] + np.array([2.0, -3.0, 2.0, -3.0]),
         atol=1e-9,
     )
+
+
+@pytest.mark.parametrize("has_boundary", [False, True])
+@pytest.mark.parametrize(
+    ("code", "transform"),
+    [
+        (4326, (CELL_DEG, 0.0, 114.5, 0.0, -CELL_DEG, 36.0)),
+        (4326, (CELL_DEG, 0.0, 114.5, 0.0, CELL_DEG, 36.0)),
+        (4326, (CELL_DEG, 2e-5, 114.5, -2e-5, -CELL_DEG, 36.0)),
+        (32650, (7.0, 0.0, 300_000.0, 0.0, -7.0, 3_984_000.0)),
+        (3035, (4_000.0, 0.0, 4_300_000.0, 0.0, -4_000.0, 2_700_000.0)),  # bent
+    ],
+)
+def test_cells_of_a_flight_map_are_read_as_their_source(
+    code: int, transform: Affine, has_boundary: bool, tmp_path: Path
+) -> None:
+    map_file = file_of_cells()
+    assert map_file.cells is not None
+    cells = replace(map_file.cells, transform=transform, crs=CRS.from_epsg(code))
+    map_file = replace(map_file, cells=cells)
+    west, south, east, north = bounds_deg(cells)
+    if has_boundary:
+        drawn = shapely.box(west, (south + north) / 2, east, north)
+        map_file = replace(map_file, boundary=shapely.MultiPolygon([drawn]))
+    order = MapOrder(table=PrescriptionTable.model_validate({"file": "grid.tif"}))
+    flight_map = compile_map(order, map_file=map_file)
+    found = read_map(write_flight_map(tmp_path / "a.flightmap.gpkg", flight_map).path)
+    assert (found.cells is None) is (code == 3035)
+    assert (found.boundary is not None) is has_boundary or code == 3035
+    points = np.random.default_rng(1).uniform((south, west), (north, east), (400, 2))
+    asked = [(float(one), float(two)) for one, two in points]
+    before, after = (
+        [(row["rate_l_ha"], row["zone"], row.get("inside")) for row in point_rates(one, asked)]
+        for one in (map_file, found)
+    )
+    if found.cells is None:
+        before, after = ([row[0] for row in rows] for rows in (before, after))
+    if transform[4] > 0.0:  # rows are counted from the north
+        before, after = ([(row[0], row[2]) for row in rows] for rows in (before, after))
+    assert sum(one != two for one, two in zip(before, after, strict=True)) <= (code == 3035)
 
 
 def polygon(*places: tuple[float, float]) -> bytes:
