@@ -2,7 +2,8 @@
 
 What was caught at each duty is averaged; where the scatter of repeated catches justifies it, a
 smoother curve stands for the means. Where flow still does not rise with duty,
-neighbours are pooled (isotonic regression), so that the curve is one that the controller takes.
+neighbours are pooled (isotonic regression), so that the curve is one that the controller takes; at
+its ends it goes no further than the duty that was measured.
 The same holds for a pump on a motor's output, with the width of its pulse in place of the duty.
 """
 
@@ -31,13 +32,14 @@ PULSE_FULL_US = 2500.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scale:
-    """What a catch was ordered by, in words: `full` is what stands for 1."""
+    """What a catch was ordered by, in words: `full` is what stands for 1, `limit` a setting."""
 
     name: str
     plural: str
     unit: str
     full: float
     gap_max: float
+    limit: str
 
     def say(self, duty: float) -> str:
         """Return a value as it was typed.
@@ -48,11 +50,12 @@ class Scale:
         return f"{self.full * duty:.6g}{self.unit}"
 
 
-DUTY = Scale(name="duty", plural="duties", unit="", full=1.0, gap_max=GAP_MAX)
+DUTY = Scale(name="duty", plural="duties", unit="", full=1.0, gap_max=GAP_MAX, limit="pwm.duty_max")
 # A motor's range is some 1000 us wide: the same share of it as of the duty.
 PULSE = Scale(
-    name="pulse", plural="pulses", unit=" us", full=PULSE_FULL_US, gap_max=250.0 / PULSE_FULL_US
-)
+    name="pulse", plural="pulses", unit=" us", full=PULSE_FULL_US, gap_max=250.0 / PULSE_FULL_US,
+    limit="pump.max_us",
+)  # fmt: skip
 
 
 # Whether the scatter of a bucket test justifies a smoother curve than its means, and which.
@@ -419,7 +422,8 @@ def _monotone(
     """Return the points with neighbours pooled until flow rises, and what was pooled.
 
     Pool adjacent violators; a pooled block becomes one point, because equal flows at two duties
-    have no inverse.
+    have no inverse. That of the largest duties stands at the first of them: more duty brings no
+    more. That of the least stands at the last: below it nothing is ordered.
     """
     blocks: list[tuple[float, float, int, float, float]] = []
     for duty, flow, count in zip(duties, flows, counts, strict=True):
@@ -435,9 +439,12 @@ def _monotone(
                 block[4],
             )
         blocks.append(block)
+    blocks[0] = (blocks[0][4], *blocks[0][1:])
+    blocks[-1] = (blocks[-1][3], *blocks[-1][1:])
     pooled = [
         f"the flow does not rise from {scale.name} {scale.say(low)} to {scale.say(high)}: taken "
         f"together as {flow:.3f} L/min at {scale.full * duty:.4g}{scale.unit}; measure again"
+        + (f", or set {scale.limit} to {scale.say(low)}" if high == duties[-1] else "")
         for duty, flow, _, low, high in blocks
         if high > low
     ]

@@ -99,6 +99,25 @@ def test_what_does_not_rise_is_pooled_and_said() -> None:
     assert any("does not rise from duty 0.5 to 0.6" in text for text in curve.warnings)
 
 
+def test_a_curve_ends_where_the_flow_no_longer_rises() -> None:
+    flows = even() | {0.8: [4.0, 4.02], 1.0: [4.0, 4.0]}
+    flows = {duty: caught for duty, caught in flows.items() if duty <= 0.6 or duty in (0.8, 1.0)}
+    curve = fitted(flows)
+    assert curve.duty[-1] == 0.8
+    assert curve.flow_l_min[-1] == pytest.approx(4.005)
+    assert curve.flow_curve.flow_for(1.0) == pytest.approx(4.005)
+    assert any("or set pwm.duty_max to 0.8" in text for text in curve.warnings)
+
+
+def test_a_curve_begins_where_the_flow_begins_to_rise() -> None:
+    least = min(even())
+    flows = {duty: caught[:1] for duty, caught in even().items()}  # no smoothing
+    flows[least / 2] = flows[least]
+    curve = fitted(flows)
+    assert curve.duty[0] == least
+    assert not any("duty_max" in text for text in curve.warnings)
+
+
 @pytest.mark.parametrize(
     ("change", "seconds", "said"),
     [
