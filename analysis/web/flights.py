@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,6 +24,7 @@ LIST = Limits(cpu_s=30, wait_s=90.0)
 REPORT = Limits(cpu_s=180, wait_s=600.0)
 # Older reports are removed: they can be made anew from their journals.
 REPORTS_MAX = 20
+SORTIES_MAX = 40
 # What a browser may show of a report: the page itself, which asks for nothing and runs nothing.
 _SHOWN = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox"
 _KEPT = "default-src 'none'; sandbox"
@@ -32,11 +33,12 @@ Name = Annotated[str, Field(pattern=rf"^{NAME.pattern}$", max_length=80)]
 
 
 class Asked(BaseModel):
-    """A journal by its name."""
+    """A journal by its name, and other sorties of its job for the same report."""
 
     model_config = ConfigDict(extra="forbid")
 
     file: Name
+    also: list[Name] = Field(default=[], max_length=SORTIES_MAX)
 
 
 @dataclass(slots=True)
@@ -87,25 +89,54 @@ class Flights:
         return self.state()
 
     async def make(self, asked: Asked) -> dict[str, Any]:
-        """Write the report of a flight, and find what it left."""
+        """Write the report of a flight, or of the sorties named; find what is left, and its job."""
         self.refuse_now()
-        journal = Path(self.host.journals) / asked.file
-        if not self.host.journals or journal.suffix != ".gpkg" or not journal.is_file():
-            raise HTTPException(404, f"{asked.file}: no flight of this name in journal.folder")
+        names = list(dict.fromkeys((asked.file, *asked.also)))
+        journals = [Path(self.host.journals) / name for name in names]
+        for journal in journals:
+            if not self.host.journals or journal.suffix != ".gpkg" or not journal.is_file():
+                raise HTTPException(404, f"{journal.name}: no flight of this name in the folder")
         with or_refused(), self.host.work.on("report"):
             self.report = None
-            out = self.folder / journal.stem
+            more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+            out = self.folder / f"{journals[0].stem[:60]}{more}"
             shutil.rmtree(out, ignore_errors=True)
             self._make_room()
             out.mkdir(parents=True, mode=0o700)
-            with journal_to_read(journal, self.folder) as readable:
-                path, is_open = str(readable.resolve()), readable != journal
-                report = await self._run(["report", path, "--out", journal.stem, "--json"], REPORT)
-                rest = f"{journal.stem}/rest.geojson"
-                words = ["flights", "remaining", path, "--out", rest, "--json"]
+            with ExitStack() as copies:
+                readable = [copies.enter_context(journal_to_read(j, self.folder)) for j in journals]
+                paths = [str(each.resolve()) for each in readable]
+                report = await self._run(["report", *paths, "--out", out.name, "--json"], REPORT)
+                rest = f"{out.name}/rest.geojson"
+                words = ["flights", "remaining", *paths, "--out", rest, "--json"]
                 left = await self._run(words, REPORT)
-            self.report = _told(journal.name, out, report, left) | {"is_open": is_open}
+            self.report = _told(names, out, report, left) | {
+                "is_open": readable != journals,
+                "job": await self._job(journals[0]),
+            }
         return self.state()
+
+    async def _job(self, journal: Path) -> dict[str, list[str]]:
+        """Return the sorties of a flight's job by its plan's id, and flights that may be of it.
+
+        A run's own journal, the newest, is known by its copy, which has no others beside it.
+        """
+        listed = self.listed.get("flights", [])
+        asked = [journal]
+        if len(listed) > 1 and listed[0]["state"] == "open":
+            other = listed[listed[0]["file"] == journal.name]["file"]
+            asked.append(journal.with_name(other))
+        found = []
+        for each in asked:
+            with journal_to_read(each, self.folder) as readable:
+                words = ["flights", "job", str(readable.resolve()), "--json"]
+                found.append((await self._run(words, LIST)).found)
+        job = found[0].get("job")
+        same = [its for its in found if its is found[0] or (job and its.get("job") == job)]
+        return {
+            key: sorted({Path(one["file"]).name for its in same for one in its.get(key, [])})
+            for key in ("sorties", "perhaps")
+        }
 
     def _make_room(self) -> None:
         """Remove the oldest reports beyond those that are kept."""
@@ -118,12 +149,13 @@ class Flights:
         return await run_child(words, self.folder, limits, flying=self.host.flying)
 
 
-def _told(name: str, out: Path, report: Outcome, left: Outcome) -> dict[str, Any]:
+def _told(names: list[str], out: Path, report: Outcome, left: Outcome) -> dict[str, Any]:
     """Return what the page says of a report and of what was left."""
     found = report.found
     warnings = found.get("warnings", []) if report.error is None else []
     return {
-        "file": name,
+        "file": names[0],
+        "files_of": names,
         "flight": out.name,
         "error": report.error,
         "verdict": found.get("verdict"),

@@ -22,7 +22,7 @@ async function doing(word, work) {
   show();
 }
 
-const report = (file) => doing("Writing the report", () => ask("flights/report", { file }));
+const report = (file, also = []) => doing("Writing the report", () => ask("flights/report", { file, also }));
 
 function markOf(flight) {
   const marks = [];
@@ -69,7 +69,7 @@ function leftOf(told) {
   for (const text of left.unread ?? []) parts.push(make("p", `not read: ${text}`, "refused"));
   if (!(left.remaining_ha > 0)) return parts;
   parts.push(make("h3", "Continue"));
-  if ((facts.parts ?? []).some((one) => one.name === "office")) {
+  if (told.files_of.length === 1 && (facts.parts ?? []).some((one) => one.name === "office")) {
     const row = make("p"), link = make("a", "Plan what is left", "button");
     link.href = `../office/#done=${encodeURIComponent(told.file)}`;
     row.append(link);
@@ -77,8 +77,26 @@ function leftOf(told) {
   }
   if (told.is_open && facts.spares_treated) parts.push(make("p", "In this run: release STOP, enable, and fly the same mission again. Valves stay closed over ground that is treated."));
   const after = make("p", told.is_open ? "After a restart of the companion: " : "The next time the companion starts: ");
-  after.append(make("code", `vrspray run --config ${state.config} --continue ${state.journals}/${told.file}`));
+  after.append(make("code", `vrspray run --config ${state.config} ${told.files_of.map((one) => `--continue ${state.journals}/${one}`).join(" ")}`));
   parts.push(after);
+  return parts;
+}
+
+function together(names, text) {
+  const row = make("p"), button = make("button", text);
+  button.type = "button";
+  button.disabled = Boolean(state.not_now);
+  button.addEventListener("click", () => report(names[0], names.slice(1)));
+  row.append(button);
+  return row;
+}
+
+// Only the plan's id makes flights one job; others of the same map are named, and joined when asked.
+function jobOf(told) {
+  const { sorties, perhaps } = told.job, parts = [];
+  if (sorties.length > told.files_of.length) parts.push(make("p", `${told.file} is one of ${sorties.length} sorties of one plan: ${sorties.join(", ")}.`), together(sorties, `Report of the job: ${sorties.length} sorties`));
+  const others = perhaps.filter((one) => !told.files_of.includes(one));
+  if (others.length) parts.push(make("p", `Flown over the same map within 48 hours, perhaps for the same job, perhaps a second treatment: ${others.join(", ")}.`, "small"), together([...new Set([...told.files_of, ...sorties, ...others])], "They are one job: report them together"));
   return parts;
 }
 
@@ -86,7 +104,8 @@ function showReport() {
   const told = state.report;
   byId("report-card").hidden = !told;
   if (!told) return;
-  byId("report-title").textContent = `Report of ${told.file}`;
+  const count = told.files_of.length;
+  byId("report-title").textContent = `Report of ${count > 1 ? `a job, ${count} sorties: ${told.files_of.join(", ")}` : told.file}`;
   const parts = told.marks.map((text) => make("p", text, "mark-text"));
   if (told.error) parts.push(make("p", told.error, "refused"));
   if (told.verdict) parts.push(make("p", told.verdict.sentence, "verdict"));
@@ -94,7 +113,7 @@ function showReport() {
   const row = make("p");
   if (told.files.includes("report.html")) row.append(linkTo(told, "report.html", "Open the report"));
   for (const name of told.files.filter((one) => one !== "report.html" && !one.startsWith("."))) row.append(linkTo(told, name, name));
-  parts.push(row);
+  parts.push(row, ...jobOf(told));
   if (told.warnings.length) {
     const list = make("ul");
     list.append(...told.warnings.map((text) => make("li", text, "small")));
