@@ -82,7 +82,7 @@ FORMATS = (
     ),
     Format(
         name="isoxml", description="ISO 11783-10 task data and time log", make="isoxml_task:make",
-        suffixes=(), also=("", ".zip"), has_sorties=False,
+        suffixes=(), also=("", ".zip"),
     ),
     Format(
         name="geoparquet", description="swaths or points", make="geoparquet:make",
@@ -95,7 +95,7 @@ FORMATS = (
     ),
     Format(
         name="mcap", description="messages for Foxglove and its kin", make="mcap_file:make",
-        suffixes=(".mcap",), has_sorties=False,
+        suffixes=(".mcap",),
     ),
 )  # fmt: skip
 # A terminal looks for a folder of this name.

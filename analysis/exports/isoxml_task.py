@@ -1,5 +1,7 @@
 """A flight as ISOXML 4 (ISO 11783-10): a completed task with its field, device and time log.
 
+Of a job each sortie is a task on the same field: the totals of a task's times are of all of it.
+
 Identifiers are negative, as those that a task controller gives; so they can never be taken for
 those of the farm's own data. Text has at most 32 characters there, so that what does not fit is in
 the comments of the task, a line each.
@@ -20,7 +22,7 @@ from numpy.typing import NDArray
 from shapely import MultiPolygon, Polygon
 
 from analysis.exports.columns import utc_ms
-from analysis.exports.output import geographic
+from analysis.exports.output import ExportError, geographic
 from companion.map_formats import zipped
 
 if TYPE_CHECKING:
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
     from companion.core.boom import Boom
 
 
-# The time log of ISO 11783-10: TLG00001.xml names what TLG00001.bin holds, record by record.
+# The time logs of ISO 11783-10: TLG00001.xml names what TLG00001.bin holds, record by record.
 #
 # A record is little-endian: milliseconds of the day (uint32) and days since 1980-01-01 (uint16),
 # then what the template's position leaves empty, here north and east (int32, 1e-7 degrees), status
@@ -41,7 +43,6 @@ if TYPE_CHECKING:
 
 Ints = NDArray[np.int64]
 
-LOG_NAME = "TLG00001"
 BOOM = "DET-2"
 # Of the data dictionary: [0.01 mm3/m2], [mm3/s], [mm], none, [mm/s], [0.1 Pa] of a resolution.
 SETPOINT_RATE, ACTUAL_RATE, ACTUAL_FLOW = 1, 2, 37
@@ -108,7 +109,7 @@ def logged(samples: Samples) -> list[Logged]:
 
 
 def template(values: list[Logged]) -> bytes:
-    """Return TLG00001.xml: attributes without a value stand for what each record holds."""
+    """Return a log's template: attributes without a value stand for what each record holds."""
     time = Element("TIM", A="", D="4")
     SubElement(time, "PTN", A="", B="", D="", H="", I="")
     for each in values:
@@ -119,7 +120,7 @@ def template(values: list[Logged]) -> bytes:
 
 
 def records(samples: Samples, values: list[Logged]) -> bytes:
-    """Return TLG00001.bin."""
+    """Return a log."""
     value = [("place", "u1"), ("raw", "<i4")]
     kind = np.dtype(
         [
@@ -177,55 +178,76 @@ def _printable(name: str) -> str:
 
 def make(source: Source, out: Path) -> Content:
     """Return the files of the folder, or one zip with the folder in it."""
-    values = logged(source.samples)
-    log = records(source.samples, values)
-    files = {
-        f"{LOG_NAME}.bin": log,
-        f"{LOG_NAME}.xml": template(values),
-        TASK_DATA: _task_data(source, len(log), values),
-    }
+    every = {f"TLG{number:05d}": part for number, part in enumerate(source.parts, start=1)}
+    if any(each.flight.setup.boom != source.flight.setup.boom for each in every.values()):
+        raise ExportError(
+            "isoxml describes one boom; export the sorties of each boom by themselves"
+        )
+    values = {name: logged(part.samples) for name, part in every.items()}
+    logs = {name: records(part.samples, values[name]) for name, part in every.items()}
+    files = {f"{name}.bin": log for name, log in logs.items()}
+    files |= {f"{name}.xml": template(its) for name, its in values.items()}
+    root = _opening(source, max(values.values(), key=len))
+    for number, (name, part) in enumerate(every.items(), start=1):
+        _add_task(root, part, number, name, len(logs[name]))
+    # Elements of one kind stand together, those that others refer to first.
+    root[:] = sorted(root, key=lambda each: _ORDER.index(each.tag))
+    indent(root)
+    files[TASK_DATA] = tostring(root, encoding="UTF-8", xml_declaration=True) + b"\n"
     if out.suffix.casefold() != ".zip":
         return {name: [content] for name, content in files.items()}
     return {out.name: [zipped({f"TASKDATA/{name}": one for name, one in files.items()})]}
 
 
-def _task_data(source: Source, log_bytes: int, values: list[Logged]) -> bytes:
-    about, boom = source.about, source.flight.setup.boom
-    maker = _printable(about.exported_by)
+_ORDER = ("DVC", "PFD", "PDT", "WKR", "TSK")
+
+
+def _opening(source: Source, values: list[Logged]) -> Element:
+    """Return the file with what its tasks refer to: device and field."""
+    about = source.about
     root = Element(
         "ISO11783_TaskData",
         VersionMajor="4",
         VersionMinor="3",
         ManagementSoftwareManufacturer="vrspray",
-        ManagementSoftwareVersion=maker,
+        ManagementSoftwareVersion=_printable(about.exported_by),
         TaskControllerManufacturer="vrspray",
         TaskControllerVersion=_printable(about.recorded_by),
         DataTransferOrigin="2",
     )
-    totals = _totals(source.samples)
-    add_device(root, boom, about, values=values, totals=list(totals))
+    boom = source.flight.setup.boom
+    add_device(root, boom, about, values=values, totals=list(_totals(source.samples)))
     _add_field(root, source)
-    SubElement(root, "PDT", A="PDT-1", B=_printable(_product(source)))
-    task = SubElement(root, "TSK", A="TSK-1", B=_printable(about.title), E="PFD-1", G=_COMPLETED)
-    if about.operator is not None:
-        worker = Element("WKR", A="WKR-1", B=_printable(about.operator))
-        root.insert(list(root).index(task), worker)
+    return root
+
+
+def _named(root: Element, tag: str, name: str) -> str:
+    """Return the identifier of a product or worker, which is added with the first of the name."""
+    there = root.findall(tag)
+    for each in there:
+        if each.attrib["B"] == name:
+            return each.attrib["A"]
+    return SubElement(root, tag, A=f"{tag}-{len(there) + 1}", B=name).attrib["A"]
+
+
+def _add_task(root: Element, part: Source, number: int, log_name: str, log_bytes: int) -> None:
+    about = part.about
+    product = _named(root, "PDT", _printable(_product(part)))
+    title = _printable(about.title)
+    task = SubElement(root, "TSK", A=f"TSK-{number}", B=title, E="PFD-1", G=_COMPLETED)
     time = SubElement(
         task, "TIM", A=about.started_utc, B=about.ended_utc,
-        C=str(round(source.flight.duration_s)), D=_EFFECTIVE,
+        C=str(round(part.flight.duration_s)), D=_EFFECTIVE,
     )  # fmt: skip
-    for ddi, total in totals.items():
+    for ddi, total in _totals(part.samples).items():
         SubElement(time, "DLV", A=f"{ddi:04X}", B=str(total), C=BOOM)
     if about.operator is not None:
-        SubElement(task, "WAN", A="WKR-1")
+        SubElement(task, "WAN", A=_named(root, "WKR", _printable(about.operator)))
     SubElement(task, "DAN", A=client_name(about), C=DEVICE)
-    SubElement(task, "PAN", A="PDT-1", E=BOOM)
-    for comment in _comments(source):
+    SubElement(task, "PAN", A=product, E=BOOM)
+    for comment in _comments(part):
         SubElement(task, "CAN", C=comment)
-    SubElement(task, "TLG", A=LOG_NAME, B=str(log_bytes), C="1")
-    indent(root)
-    content: bytes = tostring(root, encoding="UTF-8", xml_declaration=True)
-    return content + b"\n"
+    SubElement(task, "TLG", A=log_name, B=str(log_bytes), C="1")
 
 
 def _totals(samples: Samples) -> dict[int, int]:

@@ -1,7 +1,8 @@
 """A flight as MCAP messages in JSON, for Foxglove and its kin: position, spraying, events.
 
-Times are those of the flight in UTC. Chunks are small, so that a file that was cut in transfer
-loses little. The facts of the flight are a metadata record named `vrspray`.
+Times are those of the flight in UTC. Of a job each sortie has topics of its own. Chunks are small,
+so that a file that was cut in transfer loses little. The facts of the flight are a metadata record
+named `vrspray`.
 """
 
 from __future__ import annotations
@@ -66,15 +67,18 @@ def make(source: Source, out: Path) -> Content:
     writer = Writer(packed, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
     writer.start(profile="", library=source.about.exported_by)
     writer.add_metadata("vrspray", _facts(source))
-    position = _channel(writer, "/position", "foxglove.LocationFix", _LOCATION)
-    spray = _channel(writer, "/spray", "vrspray.Applied", _spray_properties())
-    event = _channel(writer, "/events", "vrspray.Event", _EVENT)
-    ms = utc_ms(source.samples.utc_s).tolist()
-    messages = [
-        *zip(ms, _positions(source, ms), [position] * len(ms), strict=True),
-        *zip(ms, _sprayed(source, ms), [spray] * len(ms), strict=True),
-        *((at, text, event) for at, text in _events(source)),
-    ]
+    messages: list[tuple[int, str, int]] = []
+    for number, part in enumerate(source.parts, start=1):
+        begin = f"/sortie_{number}" if source.also else ""
+        position = _channel(writer, f"{begin}/position", "foxglove.LocationFix", _LOCATION)
+        spray = _channel(writer, f"{begin}/spray", "vrspray.Applied", _spray_properties())
+        event = _channel(writer, f"{begin}/events", "vrspray.Event", _EVENT)
+        ms = utc_ms(part.samples.utc_s).tolist()
+        messages += [
+            *zip(ms, _positions(part, ms), [position] * len(ms), strict=True),
+            *zip(ms, _sprayed(part, ms), [spray] * len(ms), strict=True),
+            *((at, text, event) for at, text in _events(part)),
+        ]
     messages.sort(key=lambda message: message[0])
     for number, (at, text, channel) in enumerate(messages):
         at_ns = at * _NS_A_MS

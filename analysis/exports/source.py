@@ -60,6 +60,11 @@ class Source:
         own = swaths_of(self.flight, self.record)
         return joined([own, *(each.swaths for each in self.also)])
 
+    @property
+    def parts(self) -> tuple[Source, ...]:
+        """Return each sortie by itself."""
+        return (replace(self, also=()), *self.also) if self.also else (self,)
+
     @cached_property
     def about(self) -> About:
         """Return the facts of the flight."""
