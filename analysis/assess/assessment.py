@@ -344,12 +344,12 @@ class Essentials:
     balance: Balance
 
 
-def essentials_of(flight: AppliedFlight) -> Essentials:
+def essentials_of(flight: AppliedFlight, *, marked: bool = False) -> Essentials:
     """Return what `figures_of` takes; EvaluationError where there is nothing to evaluate."""
     record = record_of(flight)
     strips = strips_of(record)
     changes = changes_of(record, strips)
-    ground = ground_of(flight, record, strips, treated_of(flight))
+    ground = ground_of(flight, record, strips, treated_of(flight), marked=marked)
     return Essentials(
         evaluation=changes,
         worst=worst_of(flight, changes.steps),

@@ -12,6 +12,7 @@ flights elsewhere.
 from __future__ import annotations
 
 import math
+import zlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -190,7 +191,8 @@ class Ground:
 
     `untreated_m2` has a rate and was not treated in this flight: `missed_m2` of it lay under what
     this flight flew, `between_m2` of that between two passes; all else is left to other flights.
-    `own` is the ground of the planned lines that were flown; None without any lines.
+    `own` is the ground of the planned lines that were flown; None without any lines. `marks` says
+    of each point, where asked for, whether it was treated, treated twice, and to be treated.
     """
 
     treated_m2: float
@@ -202,6 +204,7 @@ class Ground:
     untreated_l: float
     rated_m2: float
     own: BaseGeometry | None = None
+    marks: bytes | None = None
 
 
 def ground_of(
@@ -211,6 +214,7 @@ def ground_of(
     treated: Treated,
     *,
     also: Sequence[tuple[AppliedFlight, FlightRecord, Sequence[Strip]]] = (),
+    marked: bool = False,
 ) -> Ground:
     """Return what became of the field, in a flight or with those that went on after it."""
     field = record.prescription.field
@@ -227,11 +231,15 @@ def ground_of(
     every = ((flight, record, strips), *also)
     grounds = [_flown(*each) for each in every]
     swept, own = (shapely.union_all(each) for each in zip(*grounds, strict=True))
-    at = (east_m[bare], north_m[bare])
-    missed = within(own, *at)
+    due = within(own, east_m, north_m) & (rates > 0.0)
     if record.treated is not None:
-        missed &= ~record.treated.covered_at(*at)
-    between = missed & ~within(swept, *at)
+        due &= ~record.treated.covered_at(east_m, north_m)
+    missed = due[bare]
+    between = missed & ~within(swept, east_m[bare], north_m[bare])
+    marks = None
+    if marked:
+        each_one = [is_wet, within(treated.twice, east_m, north_m), due]
+        marks = zlib.compress(np.packbits(each_one, axis=1).tobytes())
     return Ground(
         treated_m2=treated.area.area,
         doubled_m2=treated.twice.area,
@@ -242,6 +250,7 @@ def ground_of(
         untreated_l=float(rates[bare].sum()) * each_m2 / 1e4,
         rated_m2=int((rates > 0.0).sum()) * each_m2,
         own=None if all(each[2][0].track.planned is None for each in every) else own,
+        marks=marks,
     )
 
 

@@ -34,6 +34,7 @@ from analysis.flown.applied_record import EvaluationError
 from analysis.flown.holes import GAP_S
 from analysis.flown.read_applied import OFFSET_S_MAX, flight_of
 from analysis.journals.content import damages
+from analysis.journals.jobs import Sortie
 from analysis.report.legal_fields import told_in
 from companion.core.setup import Setup
 from companion.errors import JournalError, UnreadableError
@@ -202,7 +203,7 @@ def _evaluated(journal: OpenJournal, setup: Setup, row: Row) -> Row:
     unread: list[str] = []
     try:
         flight = flight_of(journal, setup, unread, is_sound=True)
-        assessment = essentials_of(flight)
+        assessment = essentials_of(flight, marked=row["job"] is not None)
     except (EvaluationError, JournalError, ShapelyError, *DAMAGE) as error:
         # One strange flight is no reason to lose the others.
         found["why_not_evaluated"] = one_line(error).removeprefix(f"{journal.path}: ")
@@ -215,6 +216,7 @@ def _evaluated(journal: OpenJournal, setup: Setup, row: Row) -> Row:
     evaluation = assessment.evaluation
     found |= {
         "area_ha": figures.area_ha,
+        "own_area_ha": figures.area_ha,
         "applied_l": figures.applied_l,
         "applied_by": figures.applied_by,
         "modelled_l": assessment.balance.model_l,
@@ -223,6 +225,7 @@ def _evaluated(journal: OpenJournal, setup: Setup, row: Row) -> Row:
         "within_10_percent": figures.within_10_percent,
         "missed_m2": figures.missed_m2,
         "doubled_m2": figures.doubled_m2,
+        "own_doubled_m2": figures.doubled_m2,
         "untreated_m2": figures.untreated_m2,
         "outside_ml": figures.outside_ml,
         "changes": figures.lag_count,
@@ -230,6 +233,7 @@ def _evaluated(journal: OpenJournal, setup: Setup, row: Row) -> Row:
         "apart_changes": evaluation.apart,
         "mean_lag_m": figures.mean_lag_m,
         "worst_lag_m": figures.worst_m,
+        "ground": assessment.ground.marks if is_whole else None,
     }
     return versioned(found)
 
@@ -253,6 +257,7 @@ def _row(journal: OpenJournal, setup: Setup, digest: str, machine: str | None) -
         "lost_rows": int(meta["lost"]),
         "is_evaluated": False,
         "machine": told.get("application.aircraft") or machine,
+        "job": Sortie(path=journal.path, meta=meta).job,
         "field": told.get("application.field_name") or told.get("application.parcel"),
         "product": told.get("product.name"),
         "operator": _operator(told),

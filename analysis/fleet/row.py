@@ -19,7 +19,7 @@ Type = Literal[
 ]
 
 # A row of another meaning is made anew by the next `fleet add`.
-ROW_VERSION = 1
+ROW_VERSION = 2
 KINDS = ("real", "unknown", "training", "simulated")
 # What a journal is worth beside another of the same flight; the end of the flight tells most.
 STATES = {"no": "cut", "salvaged": "salvaged", "recovered": "recovered", "yes": "closed"}
@@ -46,6 +46,7 @@ COLUMNS = (
     Column("is_evaluated", "yes or no", "whether the figures of the report are in the row"),
     Column("why_not_evaluated", "text", "such as: nothing was sprayed"),
     Column("machine", "text", "`application.aircraft`, or what `--machine` said"),
+    Column("job", "text", "id of the plan; its flights are sorties of one job"),
     Column("field", "text", "`application.field_name`, else the parcel"),
     Column("product", "text", "`product.name`"),
     Column("operator", "text", "a number made of the name; `fleet forget` removes it"),
@@ -59,7 +60,13 @@ COLUMNS = (
     Column("latitude_deg", "number", "of the field's origin, to 10 m"),
     Column("longitude_deg", "number", "of the field's origin, to 10 m"),
     Column("field_ha", "number", "area where spraying was allowed"),
-    Column("area_ha", "number", "ground treated; by the raster until the flight is evaluated"),
+    Column(
+        "area_ha",
+        "number",
+        "ground treated, by the raster until the flight is evaluated; without what an earlier "
+        "sortie of its job treated, so that sums are true",
+    ),
+    Column("own_area_ha", "number", "the same without regard to other sorties"),
     Column("applied_l", "number", "litres"),
     Column("applied_by", "text", "`flow meter`, `model`, `orders` (not evaluated), or `nothing`"),
     Column("modelled_l", "number", "litres by executed changes, curves and lags"),
@@ -70,8 +77,9 @@ COLUMNS = (
         "number",
         "share of the ground under its passes that got its rate within 10 %",
     ),
-    Column("missed_m2", "number", "under its passes, and left bare"),
-    Column("doubled_m2", "number", "treated twice"),
+    Column("missed_m2", "number", "under its passes, and left bare by all sorties of its job"),
+    Column("doubled_m2", "number", "treated twice, by it or with an earlier sortie"),
+    Column("own_doubled_m2", "number", "treated twice by this flight alone"),
     Column("untreated_m2", "number", "of the field with a rate, not treated in this flight"),
     Column("outside_ml", "number", "left the field or fell in an exclusion"),
     Column("changes", "whole number", "changes of rate whose lag was measured"),

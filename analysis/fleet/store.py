@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import io
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +22,7 @@ import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 from fsspec.core import url_to_fs
 
+from analysis.fleet.jobs import counted_once
 from analysis.fleet.row import COLUMNS, ROW_VERSION, Problem, Row, newest
 from companion.atomic_write import write_atomically
 from companion.errors import ConfigError
@@ -42,7 +43,8 @@ _TYPES: dict[str, pa.DataType] = {
     "valves": pa.list_(pa.struct([("valve", pa.string()), ("flow_factor", pa.float64())])),
 }
 PARTED_BY = ("kind", "month")
-SCHEMA = pa.schema([(each.name, _TYPES[each.type]) for each in COLUMNS])
+# `ground` is what `analysis.fleet.jobs` counts, and nobody is asked for it.
+SCHEMA = pa.schema([*((each.name, _TYPES[each.type]) for each in COLUMNS), ("ground", pa.binary())])
 _IN_FILE = pa.schema([field for field in SCHEMA if field.name not in PARTED_BY])
 _PARTING = ds.partitioning(pa.schema([(name, pa.string()) for name in PARTED_BY]), flavor="hive")
 DAMAGED_SCHEMA = pa.schema(
@@ -165,6 +167,11 @@ class Store:
             for key, row in newest(kept).items()
             if key not in known or known[key].record_version < row["record_version"]
         }
+        change = Change(
+            added=frozenset(better.keys() - known.keys()),
+            replaced=frozenset(better.keys() & known.keys()),
+        )
+        better |= self._of_their_jobs(better.values())
         by_folder: dict[str, list[Row]] = defaultdict(list)
         gone: dict[str, set[str]] = defaultdict(set)
         for key, row in better.items():
@@ -176,10 +183,20 @@ class Store:
             self._rewrite(folder, new)
         for folder, keys in sorted(gone.items()):
             self._rewrite(folder, [], without=keys)
-        return Change(
-            added=frozenset(better.keys() - known.keys()),
-            replaced=frozenset(better.keys() & known.keys()),
+        return change
+
+    def _of_their_jobs(self, new: Collection[Row]) -> dict[str, Row]:
+        """Return all flights of the jobs of new ones, whose ground is counted together."""
+        ids = {row["job"] for row in new if row.get("ground")}
+        if not ids:
+            return {}
+        there = self._again(
+            lambda: self.dataset().to_table(filter=ds.field("job").isin(ids)).to_pylist()
         )
+        by_job: dict[tuple[str, str], list[Row]] = defaultdict(list)
+        for row in newest([*new, *there]).values():
+            by_job[row["kind"], row["job"]].append(row)
+        return {row["flight_id"]: row for rows in by_job.values() for row in counted_once(rows)}
 
     def forget(self, operator: str, *, with_flights: bool) -> int:
         """Remove an operator from every file, and keep him out; return of how many flights."""
@@ -257,7 +274,7 @@ class Store:
         left, forgotten = frozenset(without), self._forgotten()
         rows = [
             kept
-            for row in newest([*old, *new]).values()
+            for row in newest([*new, *old]).values()
             if row["flight_id"] not in left and (kept := _without(row, forgotten)) is not None
         ]
         rows.sort(key=lambda row: (str(row["started_utc"]), row["flight_id"]))

@@ -1,8 +1,8 @@
 """The fleet summed up: by machine, field, product, operator and month, each kind of flight apart.
 
-All figures are those of the flights' own rows. What only an evaluated flight tells (missed and
-apart changes, lags, ground missed) is summed over the evaluated ones, and the count of the others
-stands beside it.
+All figures are those of the flights' rows, where ground of a job counts once. What only an
+evaluated flight tells (missed and apart changes, lags, ground missed) is summed over the evaluated
+ones, and the count of the others stands beside it.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ FIGURES = (
         "flights whose lags, changes and missed ground are not known yet",
     ),
     Figure("hours", "sum(duration_s) / 3600", "h", 1, "hours recorded"),
-    Figure("area_ha", "sum(area_ha)", "ha", 2, "ground treated, flight by flight"),
+    Figure("area_ha", "sum(area_ha)", "ha", 2, "ground treated; of a job's sorties once"),
     Figure("applied_l", "sum(applied_l)", "L", 1, "litres, by the meter where there is one"),
     Figure(
         "metered_percent",
@@ -85,6 +85,7 @@ FIGURES = (
         "of the ground under passes, what was treated",
     ),
     Figure("missed_m2", "sum(missed_m2)", "missed m²", 0, "under passes, and left bare"),
+    Figure("doubled_m2", "sum(doubled_m2)", "twice m²", 0, "treated twice, in one job"),
     Figure("changes", "sum(changes)", "changes", 0, "changes of rate whose lag was measured"),
     Figure("missed_changes", "sum(missed_changes)", "missed", 0, "changes that never came"),
     Figure("apart_changes", "sum(apart_changes)", "apart", 0, "changes that cannot be measured"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -11,11 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import mcap.reader
 import numpy as np
 import pyarrow.parquet as pq
 import pyogrio
 import pytest
 import shapely
+from isoxml.util.isoxml_io import isoxml_from_path
 
 from analysis.assess.assessment import Assessment, assess, together
 from analysis.assess.ground import Treated, treated_of
@@ -27,6 +30,7 @@ from analysis.journals.jobs import sortie_of
 from analysis.report.build import Report, ReportOptions, build_report
 from analysis.report.job import build_job
 from companion.cli.app import execute
+from tests.companion.web_site import served, until
 from tests.ground_judge import Field, Truth, Verdict, doses_of, judge, swaths_of, to_local
 
 EXAMPLE = Path("examples/anyang/config.toml")
@@ -394,6 +398,73 @@ def treated(job: Job) -> Treated:
     return treated_of(*(each.assessed.flight for each in job.flights))
 
 
+def test_a_fleet_counts_the_ground_of_a_job_once(
+    job: Job, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said, true, summed = job.report.contents["verdict"], job.verdict, []
+    first, *others = job.journals
+    for number, order in enumerate(([job.journals], [[one] for one in others] + [[first]])):
+        fleet = str(tmp_path / f"fleet-{number}")
+        for paths in order:
+            execute(["fleet", "add", *map(str, paths), "--into", fleet])
+        capsys.readouterr()
+        out = str(tmp_path / f"report-{number}")
+        execute(["fleet", "report", "--fleet", fleet, "--out", out, "--json"])
+        (section,) = json.loads(capsys.readouterr().out)["sections"]
+        summed.append(section["totals"])
+    assert summed[0] == summed[1]
+    found = summed[0]
+    assert found["flights"] == len(job.journals)
+    assert found["area_ha"] * 1e4 == pytest.approx(true.treated_m2, **job.within)
+    assert found["doubled_m2"] == pytest.approx(true.twice_m2, **job.within)
+    assert found["missed_m2"] == pytest.approx(true.missed_m2, **job.within)
+    assert found["applied_l"] == pytest.approx(true.applied_l, rel=LITRES)
+    # As the report of the job has them.
+    near = {"abs": 0.001 * true.field_m2}
+    assert found["area_ha"] * 1e4 == pytest.approx(said["area_ha"] * 1e4, **near)
+    for name in ("missed_m2", "doubled_m2"):
+        assert found[name] == pytest.approx(said[name], **near), name
+    assert found["rate_l_ha"] == pytest.approx(said["mean_rate_l_ha"], rel=1e-3)
+
+
+async def test_the_page_shows_a_job_and_its_figures_of_ground(job: Job, tmp_path: Path) -> None:
+    names = [f"flight-000{number}.gpkg" for number in (1, 2, 3)]
+    for path, name in zip(job.journals, names, strict=True):
+        shutil.copyfile(path, tmp_path / name)
+    host = {
+        "folder": str(tmp_path / "state"), "config": [], "upload_link": "",
+        "journals": str(tmp_path),
+    }  # fmt: skip
+    true = job.verdict
+    async with served(host=host) as site:
+        site.show(armed=False, in_air=False)
+        await until(lambda: site.ask("GET", "/api/v1/flights").json["not_now"] is None)
+        listed = (await site.asked("POST", "/api/v1/flights/look", {})).json["flights"]
+        said = sum(each["applied_l"] for each in listed)
+        assert said == pytest.approx(true.applied_l, rel=2.0 * LITRES)
+        body: dict[str, Any] = {"file": names[1]}
+        for flights in (job.flights[1:2], job.flights):
+            its = judge([each.truth for each in flights], job.flights[0].field)
+            told = (await site.asked("POST", "/api/v1/flights/report", body)).json["report"]
+            assert told["job"] == {"sorties": names, "perhaps": []}
+            said, left = told["verdict"], told["left"]
+            assert said["area_ha"] * 1e4 == pytest.approx(its.treated_m2, **job.within)
+            assert said["missed_m2"] == pytest.approx(its.missed_m2, **job.within)
+            assert said["doubled_m2"] == pytest.approx(its.twice_m2, **job.within)
+            assert said["untreated_m2"] == pytest.approx(its.bare_m2, **job.within)
+            assert said["applied_l"] == pytest.approx(its.applied_l, rel=LITRES)
+            assert left["field_ha"] * 1e4 == pytest.approx(true.field_m2, rel=1e-3)
+            assert left["treated_ha"] * 1e4 == pytest.approx(its.treated_m2, **job.within)
+            # No valve is for slivers.
+            half_m = 0.5 * left["narrowest_m"]
+            bare = job.flights[0].field.rated.difference(its.treated)
+            wide = bare.buffer(-half_m, join_style="mitre").buffer(half_m, join_style="mitre")
+            assert left["remaining_ha"] * 1e4 == pytest.approx(wide.area, **job.within)
+            assert left["remaining_l"] == pytest.approx(20.0 * left["remaining_ha"], rel=1e-6)
+            # Joined by who asks for it, in one report.
+            body = {"file": names[0], "also": names[1:]}
+
+
 def test_a_ferry_along_a_line_of_another_sortie_is_no_flight_of_it(
     job: Job, tmp_path: Path
 ) -> None:
@@ -464,8 +535,46 @@ def test_one_file_has_the_ground_and_litres_of_all_sorties(
     assert area == pytest.approx(job.verdict.treated_m2, abs=2 * AREA * job.verdict.field_m2)
 
 
+def test_a_terminal_finds_each_sortie_of_a_job_as_a_task(job: Job, tmp_path: Path) -> None:
+    out = tmp_path / "TASKDATA"
+    assert execute(["export", *map(str, job.journals[::-1]), "--out", str(out)]) == 0
+    data, logs = isoxml_from_path(out)
+    assert len(data.partfields) == len(data.products) == len(data.devices) == 1
+    assert len(data.tasks) == len(logs) == len(job.flights)
+    for task, flight in zip(data.tasks, job.flights, strict=True):
+        assert task.partfield_id_ref == data.partfields[0].id
+        assert task.device_allocations[0].client_name_value == data.devices[0].client_name
+        assert (
+            task.times[0].start.to_datetime().isoformat()[:16]
+            <= (flight.contents["flight"]["spraying_from"][:16])
+        )
+        totals = {
+            int.from_bytes(each.process_data_ddi): each.process_data_value
+            for each in task.times[0].data_log_values
+        }
+        assert totals[351] / 1e3 == pytest.approx(flight.verdict.applied_l, rel=LITRES)
+        (log,) = task.time_logs
+        assert log.filelength == (out / f"{log.filename}.bin").stat().st_size
+
+
+def test_messages_of_a_job_have_topics_by_sortie(job: Job, tmp_path: Path) -> None:
+    out = tmp_path / "job.mcap"
+    assert execute(["export", *map(str, job.journals[::-1]), "--out", str(out)]) == 0
+    reader = mcap.reader.make_reader(io.BytesIO(out.read_bytes()))
+    found: dict[str, list[tuple[int, float]]] = {}
+    for _, channel, message in reader.iter_messages(log_time_order=False):
+        volume_ml = json.loads(message.data).get("volume_ml") or 0.0
+        found.setdefault(channel.topic, []).append((message.log_time, volume_ml))
+    for number, flight in enumerate(job.flights, start=1):
+        rows = found[f"/sortie_{number}/spray"]
+        assert rows == sorted(rows, key=lambda row: row[0])
+        litres = sum(volume_ml for _, volume_ml in rows) / 1e3
+        assert litres == pytest.approx(flight.verdict.applied_l, rel=LITRES)
+        assert {f"/sortie_{number}/position", f"/sortie_{number}/events"} & {*found}
+
+
 def test_what_holds_one_flight_refuses_a_job(job: Job, tmp_path: Path) -> None:
-    for words in (["--out", "TASKDATA"], ["--out", "a.csv", "--format", "csv-samples"]):
-        out = str(tmp_path / words[1])
-        with pytest.raises(ExportError, match="holds one flight; export each sortie by itself"):
-            export.main([*map(str, job.journals), "--out", out, *words[2:]], standalone_mode=False)
+    out = str(tmp_path / "a.csv")
+    words = [*map(str, job.journals), "--out", out, "--format", "csv-samples"]
+    with pytest.raises(ExportError, match="holds one flight; export each sortie by itself"):
+        export.main(words, standalone_mode=False)
