@@ -1,12 +1,13 @@
-"""What every picture of ground has in common: a scale bar and where north is.
+"""What every picture of ground has in common: colours of rates, a scale bar and where north is.
 
-Maps, plans, reports and the demo are drawn in several packages; how long a scale bar is and what
-it looks like is said here once. Nothing here imports matplotlib: the caller's axes draw.
+Maps, plans, reports and the demo are drawn in several packages; what these look like is said here
+once. Nothing here imports matplotlib: the caller's axes draw.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -15,8 +16,25 @@ if TYPE_CHECKING:
 
 _DARK, _PALE = "black", "0.72"
 _BAR_PT = 4.0
+# Rates on all pictures of a map: the darker, the more.
+RATES_MAP = "viridis_r"
 # Of a map's width at most.
 SHARE_MAX = 0.25
+
+
+def rate_ends(rates_l_ha: Iterable[float]) -> tuple[float, float]:
+    """Return the rates at both ends of a map's scale of colours, on every picture of that map.
+
+    They lie a quarter of the map's span beyond its own rates: ground that got too little is paler
+    than the least of them, and ground that was sprayed twice is darker than the largest.
+
+    >>> rate_ends([15.0, 25.0, 0.0]), rate_ends([20.0]), rate_ends([0.0])
+    ((12.5, 27.5), (10.0, 30.0), (0.5, 1.5))
+    """
+    sprayed = [rate for rate in rates_l_ha if rate > 0.0] or [1.0]
+    least, most = min(sprayed), max(sprayed)
+    beyond = (most - least) / 4.0 or most / 2.0
+    return max(least - beyond, 0.0), most + beyond
 
 
 def scale_length_m(width_m: float, *, share: float = SHARE_MAX) -> float:

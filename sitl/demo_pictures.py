@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from analysis.published import p1_lag_distance_m
 from analysis.report import figure_style
 from analysis.report.figure_style import FAINT, INK, QUIET
-from companion.map_pictures import draw_bar, length_text
+from companion.map_pictures import RATES_MAP, draw_bar, length_text, rate_ends
 from sitl.anyang import demo_setup
 from sitl.demo import (
     CELL_M,
@@ -245,8 +245,6 @@ WET_SHARE = 0.1
 # Where the colours are dark, figures on them are white.
 DARK_FROM = 0.3
 PASSES = 4
-# The colours go on a little beyond the map's rates, so that too much can be seen.
-BEYOND_L_HA = 1.0
 
 
 def map_figure(result: DemoResult) -> Figure:
@@ -255,8 +253,8 @@ def map_figure(result: DemoResult) -> Figure:
     setup, flown = demo_setup(speed_m_s), shown(result)
     axes = field_axes(setup)
     rates = setup.prescription.rates_l_ha
-    norm = Normalize(rates[0] - BEYOND_L_HA, rates[-1] + BEYOND_L_HA)
-    colours = matplotlib.colormaps["viridis_r"].with_extremes(bad=BARE)
+    norm = Normalize(*rate_ends(rates))
+    colours = matplotlib.colormaps[RATES_MAP].with_extremes(bad=BARE)
     figure = new_figure(
         (10.0, 7.2),
         "Prescribed and applied",

@@ -13,6 +13,7 @@ from analysis.strips import strips_of
 from companion.core.types import Decision
 from companion.errors import ConfigError
 from companion.journal.journal import Journal
+from companion.map_pictures import RATES_MAP, rate_ends
 from companion.simulated import SIMULATED, Simulated
 from companion.wording import missing
 from missions.maps.compiling import MapOrder, job_of
@@ -181,16 +182,14 @@ def draw(
     figure = Figure(figsize=(12, 9), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplot_mosaic([["asked", "applied"], ["flow", "flow"]], height_ratios=[3, 1])
-    most = max(record.prescription.rates_l_ha) or 1.0
     figure.suptitle(f"SIMULATED {title}")
     if title:
         image = _draw_share(record, axes["applied"])
         figure.colorbar(image, ax=axes["applied"], label="% of prescribed", extend="max")
     else:
-        image = _draw_applied(record, axes["applied"], most)
-        figure.colorbar(image, ax=axes["applied"], label="L/ha", extend="max")
-        most = image.norm.vmax
-    _draw_asked(record, axes["asked"], most)
+        image = _draw_applied(record, axes["applied"])
+        figure.colorbar(image, ax=axes["applied"], label="L/ha", extend="both")
+    _draw_asked(record, axes["asked"])
     for name, each in records.items():
         _draw_flow(each, axes["flow"], name)
     if len(records) > 1:
@@ -210,13 +209,15 @@ def _window(record: FlightRecord) -> tuple[float, float, float, float]:
     )
 
 
-def _draw_asked(record: FlightRecord, axes: Axes, most_l_ha: float) -> None:
+def _draw_asked(record: FlightRecord, axes: Axes) -> None:
     import shapely
-    from matplotlib import colormaps
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path as Outline
 
+    from missions.maps.picture_ground import Colours
+
     window = shapely.box(*_window(record))
+    colours = Colours.of(np.array(record.prescription.rates_l_ha))
     for zone in record.prescription.zones:
         for part in shapely.get_parts(zone.polygon.intersection(window)):
             if not isinstance(part, shapely.Polygon):
@@ -225,21 +226,18 @@ def _draw_asked(record: FlightRecord, axes: Axes, most_l_ha: float) -> None:
             outline = Outline.make_compound_path(
                 *(Outline(shapely.get_coordinates(ring), closed=True) for ring in rings)
             )
-            colour = colormaps["viridis_r"](zone.rate_l_ha / most_l_ha)
+            colour = colours(np.array(zone.rate_l_ha))
             axes.add_patch(PathPatch(outline, facecolor=colour, edgecolor="white", linewidth=0.3))
     axes.plot(record.east_m, record.north_m, color="tab:red", linewidth=0.7)
-    _frame(axes, record, f"prescribed (darkest: {most_l_ha:.0f} L/ha), and the way flown")
+    _frame(axes, record, "prescribed, and the way flown")
 
 
-def _draw_applied(record: FlightRecord, axes: Axes, most_l_ha: float) -> Any:
-    """Draw what fell; the scale of both maps reaches as far as that."""
+def _draw_applied(record: FlightRecord, axes: Axes) -> Any:
     deposit = _deposit(record, record.volume_ml, 0.5)
-    wet = deposit.cells_ml > 0.0
-    applied = np.where(wet, deposit.applied_l_ha, np.nan)
-    if wet.any():
-        most_l_ha = max(most_l_ha, float(np.percentile(applied[wet], 99.9)))
+    applied = np.where(deposit.cells_ml > 0.0, deposit.applied_l_ha, np.nan)
+    least, most = rate_ends(record.prescription.rates_l_ha)
     _frame(axes, record, "applied")
-    return _show(deposit, applied, axes, vmax=most_l_ha, cmap="viridis_r")
+    return _show(deposit, applied, axes, vmin=least, vmax=most, cmap=RATES_MAP)
 
 
 def _draw_share(record: FlightRecord, axes: Axes) -> Any:
@@ -259,7 +257,7 @@ def _draw_share(record: FlightRecord, axes: Axes) -> Any:
     share[some] = np.minimum(100.0 * given.cells_ml[some] / asked[some], SHARE_MAX)
     colours = colormaps["RdBu"].with_extremes(over="black")
     _frame(axes, record, "applied, all passes; black: nothing was prescribed there")
-    return _show(given, share, axes, vmax=SHARE_MAX, cmap=colours)
+    return _show(given, share, axes, vmin=0.0, vmax=SHARE_MAX, cmap=colours)
 
 
 def _deposit(record: FlightRecord, volume_ml: Floats, cell_m: float) -> Deposit:
@@ -285,7 +283,7 @@ def _show(deposit: Deposit, cells: Floats, axes: Axes, **more: Any) -> Any:
         south_m,
         south_m + deposit.rows * cell_m,
     )
-    return axes.imshow(cells, origin="lower", extent=extent, vmin=0.0, **more)
+    return axes.imshow(cells, origin="lower", extent=extent, **more)
 
 
 def _draw_flow(record: FlightRecord, axes: Axes, name: str) -> None:

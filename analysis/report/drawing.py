@@ -22,7 +22,6 @@ from analysis.report.figure_style import (
     GRID,
     INK,
     NOTHING_COLOUR,
-    RATES_MAP,
     RED,
     SKY,
     Drawn,
@@ -31,6 +30,7 @@ from analysis.report.figure_style import (
     new_figure,
     sheet_of,
 )
+from companion.map_pictures import RATES_MAP, rate_ends
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -94,23 +94,21 @@ NOTHING_L_HA = 1e-6
 def prescribed_and_applied(sheet: Sheet) -> Drawn:
     """Draw both maps with one scale of colours."""
     asked, given = sheet.cells.commanded_l_ha, sheet.cells.measured_l_ha
-    least, most = _rates_shown(asked, given)
+    least, most = rate_ends(sheet.flight.setup.prescription.rates_l_ha)
     figure, panels, bar = sheet.panels(2)
     colours = colormaps[RATES_MAP].with_extremes(under=NOTHING_COLOUR)
-    nothing = (asked <= NOTHING_L_HA) & (given <= NOTHING_L_HA)
     for panel, values, title in zip(panels, (asked, given), ("prescribed", "applied"), strict=True):
-        shown = np.where(nothing, -1.0, np.maximum(values, least))
+        shown = np.where(values <= NOTHING_L_HA, -1.0, np.maximum(values, least))
         mesh = _mesh(panel, sheet, shown, colours, least, most)
         dress(panel, sheet, title, with_path=title == "applied")
     # One scale for both: the north names one axis of two maps side by side.
     panels[1].set_ylabel("" if not sheet.is_wide else "north [m]")
     panels[0].set_xlabel("" if sheet.is_wide else "east [m]")
-    beyond = "max" if np.nanmax(given, initial=0.0) > most else "neither"
-    figure.colorbar(mesh, cax=bar, label="rate [L/ha]", extend=beyond)
+    figure.colorbar(mesh, cax=bar, label="rate [L/ha]", extend="both")
     return Drawn(
         name="map",
         title="Prescribed and applied",
-        caption=f"{_cells_text(sheet.cells)} The darker, the more; grey is rate 0, "
+        caption=f"{_cells_text(sheet.cells)} The darker, the more; grey is nothing, "
         "white was under no pass. The thin line is the path of the vehicle, the black one "
         "the border.",
         alt="Two maps of the field with one scale of colours: the prescribed rate of each cell, "
@@ -118,21 +116,6 @@ def prescribed_and_applied(sheet: Sheet) -> Drawn:
         kind="map",
         figure=figure,
     )
-
-
-def _rates_shown(asked: Floats, given: Floats) -> tuple[float, float]:
-    """Return the rates at both ends of the scale; from 0 where the least is not far from it.
-
-    It reaches as far as what was applied: ground that got too little is paler than the lowest rate,
-    and ground that was sprayed twice is darker than the highest.
-    """
-    known = asked[np.isfinite(asked) & (asked > 0.0)]
-    if not len(known):
-        return 0.0, 1.0
-    applied = given[np.isfinite(given) & (given > NOTHING_L_HA) & (asked > 0.0)]
-    ends = [np.percentile(each, [1.0, 99.9]) for each in (known, applied) if len(each)]
-    least, most = float(np.min(ends)), float(np.max(ends))
-    return (least if 0.5 * most < least < most else 0.0), most
 
 
 def deviation(sheet: Sheet) -> Drawn:

@@ -34,9 +34,8 @@ INK, QUIET, FAINT, GRID = "#222222", "#555555", "#8A8A8A", "#E4E4E4"
 BLUE, ORANGE, GREEN, RED, PURPLE, YELLOW, SKY = (
     "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#F0E442", "#56B4E9",
 )  # fmt: skip
-# As in all maps of the program: more is darker. Of a deviation, red is too little, blue too much,
-# and darker is further off.
-RATES_MAP, DEVIATION_MAP = "viridis_r", "RdBu"
+# Red is too little, blue too much, and darker is further off.
+DEVIATION_MAP = "RdBu"
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 10.0,

@@ -7,17 +7,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PathCollection
-from matplotlib.colors import ListedColormap, Normalize
+from matplotlib.colors import Normalize
 from matplotlib.path import Path as Outline
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
 from companion.core.frame import LocalFrame
 from companion.errors import MapError
+from companion.map_pictures import RATES_MAP, rate_ends
 from missions.maps.cells import to_degrees
 from missions.maps.convert.cell_zones import zones_of
 from missions.maps.local import project, project_all
@@ -33,8 +33,6 @@ LABELS_MAX = 80
 _LABEL_PT = 11.0
 _ZERO: Colour = (1.0, 1.0, 1.0, 1.0)
 BARE, HATCH, LINE = "0.95", "0.6", "0.2"
-# Of viridis from its light end: pale is little, and its palest still differs from white.
-_PALEST, _DARKEST = 0.04, 0.96
 _BENEATH, _RATED, _OUTLINE, _LABEL = 0.5, 1.0, 2.0, 3.0
 # Parts of a boundary without a rate below this share are the rounding of its edges.
 _BARE_SHARE = 0.002
@@ -42,7 +40,7 @@ _BARE_SHARE = 0.002
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Colours:
-    """A colour for every rate: by rank where they are few, else by value; 0 is white."""
+    """A colour for every rate, as on all pictures of the map; 0 is white."""
 
     rates_l_ha: Floats
 
@@ -58,11 +56,8 @@ class Colours:
 
     @property
     def scale(self) -> ScalarMappable:
-        """Return the scale of many rates, from the least to the largest."""
-        shades = colormaps["viridis_r"](np.linspace(_PALEST, _DARKEST, 256))
-        return ScalarMappable(
-            Normalize(self.rates_l_ha[0], self.rates_l_ha[-1]), ListedColormap(shades)
-        )
+        """Return the scale."""
+        return ScalarMappable(Normalize(*rate_ends(self.rates_l_ha.tolist())), RATES_MAP)
 
     def __call__(self, rates_l_ha: Floats) -> Floats:
         """Return red, green, blue and opacity for each rate; NaN is seen through."""
@@ -70,13 +65,7 @@ class Colours:
         result = np.zeros((*rates.shape, 4), dtype=np.float64)
         result[rates == 0.0] = _ZERO
         sprayed = rates > 0.0
-        if not self.are_listed:
-            result[sprayed] = self.scale.to_rgba(rates[sprayed])
-        elif len(self.rates_l_ha):
-            count = len(self.rates_l_ha)
-            place = np.linspace(_PALEST, _DARKEST, count) if count > 1 else np.array([0.5])
-            shades = colormaps["viridis_r"](place)
-            result[sprayed] = shades[np.searchsorted(self.rates_l_ha, rates[sprayed])]
+        result[sprayed] = self.scale.to_rgba(rates[sprayed])
         return result
 
 

@@ -18,8 +18,11 @@ from analysis.assess.ground import _lattice, within
 from analysis.flown.applied_flight import AppliedFlight, Series
 from analysis.flown.read_applied import read_applied
 from analysis.report.build import ReportOptions, build_report
-from analysis.report.drawing import _rates_shown
+from analysis.report.drawing import prescribed_and_applied
+from analysis.report.figure_style import sheet_of
 from companion.config.application_table import PROFILES
+from companion.map_pictures import rate_ends
+from missions.maps.picture_ground import Colours
 from tests.analysis.report_flight import fly
 from tests.bench.worst import disagreements
 from tests.golden.checking import names, unpacked
@@ -134,11 +137,14 @@ def test_points_of_a_field_count_its_strips_however_they_lie(turned_deg: float) 
     assert within(strips, *places).mean() == pytest.approx(strips.area / field.area, rel=2e-3)
 
 
-def test_the_scale_of_rates_reaches_down_to_what_was_applied() -> None:
-    asked = np.array([15.0, 20.0, 28.0, np.nan, 0.0])
-    assert _rates_shown(asked, asked)[0] == pytest.approx(15.1, abs=0.2)
-    # A third of the rate along a border is paler than the least that was asked for.
-    assert _rates_shown(asked, np.array([5.0, 20.0, 28.0, np.nan, 0.0]))[0] == 0.0
-    assert _rates_shown(np.array([np.nan, 0.0]), np.array([np.nan, 0.0])) == (0.0, 1.0)
-    # Ground that was sprayed twice is darker than the largest rate that was asked for.
-    assert _rates_shown(asked, np.array([30.0, 40.0, 56.0, np.nan, 0.0]))[1] > 55.0
+def test_a_rate_has_one_colour_on_report_and_map(flight: AppliedFlight) -> None:
+    cells = assess(flight).cells
+    assert cells is not None
+    prescribed, applied, _ = prescribed_and_applied(sheet_of(flight, cells)).figure.axes
+    rates = flight.setup.prescription.rates_l_ha
+    mesh, same = prescribed.collections[0], applied.collections[0]
+    assert mesh.get_clim() == same.get_clim() == rate_ends(rates)
+    assert mesh.cmap is not None
+    colours = Colours.of(np.array(rates))
+    for rate in rates:
+        assert mesh.to_rgba(rate) == pytest.approx(colours(np.array(rate)))

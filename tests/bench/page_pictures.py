@@ -79,7 +79,7 @@ async def drawn(out: Path, folder: Path) -> None:
         day = Day(bench, page, f"http://127.0.0.1:{port}/")
         day.watch()
         async with companion_of(bench, *web):
-            await bench.until(lambda: "link up" in bench.said, within_s=60.0)
+            await bench.until(lambda: "operator's page:" in bench.said, within_s=60.0)
             await day.load_and_check(files)
             await page.locator("#angle_deg").fill("0")
             await plan_and_upload(page)
@@ -90,7 +90,7 @@ async def drawn(out: Path, folder: Path) -> None:
             await page.close()
         bench.said = ""
         async with companion_of(bench, *web, *settings):
-            await bench.until(lambda: "link up" in bench.said, within_s=60.0)
+            await bench.until(lambda: "operator's page:" in bench.said, within_s=60.0)
             phone = await browser.new_page(viewport={"width": 390, "height": 844})
             day = Day(bench, phone, day.place)
             day.watch()

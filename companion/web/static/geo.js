@@ -112,8 +112,9 @@ export function boomLines(valves, vehicle, duty) {
   }));
 }
 
-const DAY = ["#b5dfae", "#74c7b6", "#3aa9c1", "#1f7fb8", "#24579f", "#232f80"];
-const NIGHT = ["#3f5fa3", "#2e8a94", "#35b779", "#8fd744", "#fde725"];
+// As on every picture of the map, pale to dark; at night, on dark ground, dark to pale.
+const NIGHT = ["#440154", "#472d7b", "#3b528b", "#2c728e", "#21918c", "#28ae80", "#5ec962", "#addc30", "#fde725"];
+const DAY = NIGHT.toReversed();
 
 function mix(a, b, share) {
   const part = (k) => Math.round(parseInt(a.slice(k, k + 2), 16) * (1 - share) + parseInt(b.slice(k, k + 2), 16) * share);
@@ -138,15 +139,20 @@ const OFF_WORDS = ["< −20", "−20 to −10", "± 10", "10 to 20", "> 20"];
 const OFF_DAY = ["#b2182b", "#ef8a62", "#8f9a92", "#67a9cf", "#2166ac"];
 const OFF_NIGHT = ["#e04a4a", "#f4a582", "#66747a", "#92c5de", "#4393f0"];
 
-// Rates as colours, from the map's least to its largest rate above nothing; or what is off from it.
+// The rates at both ends of a map's scale of colours: `rate_ends` of companion/map_pictures.py.
+export function rateEnds(rates) {
+  const above = rates.some((rate) => rate > 0) ? rates.filter((rate) => rate > 0) : [1];
+  const least = Math.min(...above), most = Math.max(...above), beyond = (most - least) / 4 || most / 2;
+  return [Math.max(least - beyond, 0), most + beyond];
+}
+
+// Rates as colours; or what is off from the map's.
 export class Scale {
   constructor(rates, theme, { aheadS = 0, byError = false } = {}) {
     this.aheadS = aheadS;
     this.byError = byError;
     this.off = theme === "night" ? OFF_NIGHT : OFF_DAY;
-    const above = rates.filter((rate) => rate > 0);
-    this.low = Math.min(...(above.length ? above : [0]));
-    this.high = Math.max(...(above.length ? above : [1]));
+    [this.low, this.high] = rateEnds(rates);
     this.stops = theme === "night" ? NIGHT : DAY;
     this.none = theme === "night" ? "rgb(42,52,58)" : "rgb(205,210,203)";
   }
@@ -162,10 +168,16 @@ export class Scale {
     return this.off.map((color, k) => [color, OFF_WORDS[k]]);
   }
 
+  // The same as an expression of MapLibre's.
+  fill(rate) {
+    const step = (this.high - this.low) / (this.stops.length - 1);
+    const scaled = this.stops.flatMap((color, k) => [this.low + step * k, color]);
+    return ["case", ["<=", rate, 0], this.none, ["interpolate", ["linear"], rate, ...scaled]];
+  }
+
   color(rate) {
     if (!(rate > 0)) return this.none;
-    const span = this.high - this.low;
-    const share = span > 0 ? Math.min(Math.max((rate - this.low) / span, 0), 1) : 0.6;
+    const share = Math.min(Math.max((rate - this.low) / (this.high - this.low), 0), 1);
     const place = share * (this.stops.length - 1);
     const index = Math.min(Math.floor(place), this.stops.length - 2);
     return mix(this.stops[index], this.stops[index + 1], place - index);

@@ -55,12 +55,7 @@ export async function create(element, ground, scale, theme, onView) {
   let points = [], zone = -1;
   let colors = scale;
   // The zones are read, cut and coloured in the worker: a map of 40,000 does not hold up this thread.
-  const zoneColor = () => {
-    const above = ground.rates_l_ha.filter((rate) => rate > 0);
-    const steps = [...new Set(Array.from({ length: 9 }, (_, k) => colors.low + ((colors.high - colors.low) * k) / 8))];
-    const scaled = above.length ? ["interpolate", ["linear"], ["get", "rate"], ...steps.flatMap((rate) => [rate, colors.color(rate)])] : colors.none;
-    return ["case", ["<=", ["get", "rate"], 0], colors.none, scaled];
-  };
+  const zoneColor = () => colors.fill(["get", "rate"]);
   const treatedFeatures = (from, to) => {
     const found = [];
     for (let i = Math.max(from, 1); i < to; i += 1) {

@@ -88,7 +88,7 @@ export class FieldMap {
   legend() {
     const box = document.getElementById("legend");
     const rows = this.rates.length <= LEGEND_MAX ? this.rates
-      : Array.from({ length: 5 }, (_, k) => this.scale.low + ((this.scale.high - this.scale.low) * k) / 4);
+      : Array.from({ length: 5 }, (_, k) => this.rates[Math.round((k * (this.rates.length - 1)) / 4)]);
     const title = document.createElement("b");
     title.textContent = unitOf("rate");
     box.replaceChildren(title, ...rows.map((rate) => {

@@ -1,14 +1,17 @@
 // The office's map by WebGL: zones, boundary, planned lines, and the corners that are being drawn.
 
+import { Scale } from "../static/geo.js";
+
 const LOOK = {
-  day: { ground: "#e2e6df", field: "#10150f", passes: ["#0a4f8f", "#a3125f", "#5b3a00", "#6b21a8"], ferry: "#b45309", draw: "#c4060c", low: "#b5dfae", high: "#232f80" },
-  night: { ground: "#0b1114", field: "#e9efe9", passes: ["#7dd3fc", "#ff9ad5", "#c5f277", "#c4a2ff"], ferry: "#ffb04d", draw: "#ff7b7b", low: "#3f5fa3", high: "#fde725" },
+  day: { ground: "#e2e6df", field: "#10150f", passes: ["#0a4f8f", "#a3125f", "#5b3a00", "#6b21a8"], ferry: "#b45309", draw: "#c4060c" },
+  night: { ground: "#0b1114", field: "#e9efe9", passes: ["#7dd3fc", "#ff9ad5", "#c5f277", "#c4a2ff"], ferry: "#ffb04d", draw: "#ff7b7b" },
 };
 const NOTHING = { type: "FeatureCollection", features: [] };
 
 export class OfficeMap {
   constructor(element, theme, { onClick, onMove }) {
     this.look = LOOK[theme];
+    this.theme = theme;
     this.element = element;
     this.draws = false;
     this.works = false;
@@ -28,7 +31,7 @@ export class OfficeMap {
     map.addControl(new maplibre.ScaleControl({ unit: "metric" }), "bottom-left");
     await new Promise((resolve, reject) => { map.once("load", resolve); map.once("error", (found) => reject(found.error)); });
     for (const name of ["zones", "field", "lines", "draw"]) map.addSource(name, { type: "geojson", data: NOTHING });
-    map.addLayer({ id: "zones", type: "fill", source: "zones", paint: { "fill-color": look.low, "fill-opacity": 0.75 } });
+    map.addLayer({ id: "zones", type: "fill", source: "zones", paint: { "fill-opacity": 0.75 } });
     map.addLayer({ id: "field", type: "line", source: "field", paint: { "line-color": look.field, "line-width": 2.5 } });
     map.addLayer({ id: "lines", type: "line", source: "lines", paint: { "line-color": ["match", ["get", "kind"], ["spray", "spray-part"], ["match", ["%", ["get", "sortie"], 4], ...look.passes.slice(0, 3).flatMap((color, k) => [k + 1, color]), look.passes[3]], look.ferry], "line-width": ["match", ["get", "kind"], ["spray", "spray-part"], 2.5, 1.5] } });
     map.addLayer({ id: "draw", type: "line", source: "draw", paint: { "line-color": look.draw, "line-width": 3, "line-dasharray": [2, 1] } });
@@ -65,8 +68,7 @@ export class OfficeMap {
     this.map.getSource("zones").setData(zones ?? NOTHING);
     this.map.getSource("field").setData(field ?? NOTHING);
     this.map.getSource("lines").setData(lines ?? NOTHING);
-    const low = Math.min(...rates), high = Math.max(...rates);
-    this.map.setPaintProperty("zones", "fill-color", high > low ? ["interpolate", ["linear"], ["to-number", ["get", "rate"], low], low, this.look.low, high, this.look.high] : this.look.low);
+    this.map.setPaintProperty("zones", "fill-color", new Scale(rates, this.theme).fill(["to-number", ["get", "rate"]]));
     this.fit();
   }
 

@@ -19,8 +19,11 @@ from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import urlsplit
 
+import numpy as np
 import pytest
 from axe_playwright_python.async_playwright import Axe
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from playwright.async_api import Browser, Locator, Page, async_playwright, expect
 from playwright.async_api import TimeoutError as PlaywrightTimeout
 
@@ -28,6 +31,7 @@ from companion.cli.web_parts import Watched, obeying
 from companion.doctor.check import Status
 from companion.link.component import ComponentOptions
 from companion.link.vehicle_link import VehicleLink
+from companion.map_pictures import RATES_MAP, rate_ends
 from companion.output.servo import ServoExecutor, ServoOptions
 from companion.runtime import run
 from companion.web import OperatorPage, listen
@@ -269,8 +273,23 @@ async def test_treated_ground_is_coloured_by_rate_or_by_error(
         off = await page.evaluate(OFF_BY, "static/geo.js")
         # 20 L/ha wanted: applied, too little, much too much, and a change that is under way.
         assert off == [0, pytest.approx(-0.15), pytest.approx(0.5), 0, None]
+        # A rate has the colour that it has on all other pictures of the map.
+        for rates in ([0.0, 15.0, 25.0], [20.0], [0.0]):
+            colours = await page.evaluate(COLOURS_OF, ["static/geo.js", rates])
+            scale = ScalarMappable(Normalize(*rate_ends(rates)), RATES_MAP)
+            wanted = scale.to_rgba(np.array(rates), bytes=True)[:, :3].astype(float)
+            near = [found for rate, found in zip(rates, colours, strict=True) if rate]
+            assert np.array(near).reshape(-1, 3) == pytest.approx(
+                wanted[np.array(rates) > 0], abs=6
+            )
         assert not flight.troubles
 
+
+COLOURS_OF = """async ([place, rates]) => {
+  const { Scale } = await import(new URL(place, document.baseURI).href);
+  const scale = new Scale(rates, "day");
+  return rates.map((rate) => scale.color(rate).match(/\\d+/g).map(Number));
+}"""
 
 OFF_BY = """async (place) => {
   const { offBy } = await import(new URL(place, document.baseURI).href);
