@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from companion.cli.answer import AsJson, JournalFile, new_app
+from companion.cli.answer import AsJson, JournalFile, answer, new_app, note
 
 if TYPE_CHECKING:
     from analysis.replay import ReplayResult
@@ -40,13 +39,11 @@ def replay_journal(
     """
     from analysis.replay import replay as run
 
-    result = run(journal, overrides=changes or (), say=lambda line: typer.echo(line, err=True))
-    typer.echo(json.dumps(asdict(result)) if as_json else _sentence(result))
-    if not as_json:
-        for line in _without_effect(changes or ()) if _is_idle(result) else _what_if(result):
-            typer.echo(line)
-    for note in _notes(result):
-        typer.echo(note, err=True)
+    result = run(journal, overrides=changes or (), say=note)
+    more = _without_effect(changes or ()) if _is_idle(result) else _what_if(result)
+    answer(asdict(result), [_sentence(result), *more], as_json=as_json)
+    for line in _notes(result):
+        note(line)
     is_same = not (result.differences or result.coverage_differs or result.unread)
     raise typer.Exit(0 if is_same else 1)
 

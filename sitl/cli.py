@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from companion.cli.answer import AsJson, new_app
+from companion.cli.answer import AsJson, answer, new_app, note
 
 
 class Board(StrEnum):
@@ -140,7 +141,6 @@ def serve(
     """
     from dataclasses import replace
 
-    from companion.errors import VrsprayError
     from missions.maps.cli.new import parse_mark
     from sitl.serve import ServeOptions
     from sitl.serve_mission import home_of_file
@@ -170,15 +170,11 @@ def serve(
         ground=ground,
         wait_s=wait_s,
     )
-    try:
-        if home is not None:
-            place_deg = home_of_file(home) or parse_mark(home, "--home")
-            options = replace(options, place_deg=place_deg)
-        result = _run(options)
-    except VrsprayError as error:
-        _print_error(str(error), as_json=json)
-        raise typer.Exit(2) from None
-    _print_result(result, as_json=json)
+    if home is not None:
+        place_deg = home_of_file(home) or parse_mark(home, "--home")
+        options = replace(options, place_deg=place_deg)
+    result = _run(options)
+    answer(result, _served(result), as_json=json)
     raise typer.Exit(0 if result["state"] in ("landed", "stopped") else 1)
 
 
@@ -243,7 +239,6 @@ def fly(
 
     Example: vrspray sitl fly --along flight.BIN --out along
     """
-    from companion.cli.answer import answer, note
     from companion.errors import ConfigError
 
     if along is not None:
@@ -306,32 +301,19 @@ def _run(options: Any) -> dict[str, Any]:
             loop.add_signal_handler(number, task.cancel)
         # What was loaded so far stays: the collector need not look at it during the flight.
         gc.freeze()
-        return await fly(options, lambda text: typer.echo(text, err=True))
+        return await fly(options, note)
 
     return asyncio.run(run())
 
 
-def _print_error(text: str, *, as_json: bool) -> None:
-    import json
-
-    typer.echo(f"error: {text}", err=True)
-    if as_json:
-        typer.echo(json.dumps({"error": text}))
-
-
-def _print_result(result: dict[str, Any], *, as_json: bool) -> None:
-    import json
-
-    if as_json:
-        typer.echo(json.dumps(result))
-        return
-    typer.echo(
+def _served(result: dict[str, Any]) -> Iterator[str]:
+    yield (
         f"{result['state']}: {result['distance_m']:.0f} m in {result['flight_s']:.0f} s, "
         f"{result['volume_l']:.3f} L sprayed"
     )
     lag = result.get("metrics", {}).get("lag_distance_m", {})
     if lag.get("count"):
-        typer.echo(
+        yield (
             f"lag distance of {lag['count']} changes: mean {lag['mean_abs']:.3f} m, "
             f"worst {lag['max_abs']:.3f} m; {result['metrics']['apart']} not measured, "
             f"{result['metrics']['missed']} missed; "
