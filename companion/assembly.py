@@ -47,10 +47,10 @@ LINE_STEP_M = 1.0
 RATES_NAMED_MAX = 6
 
 
-def flight_map_of(config: Config, overrides: Sequence[str] = ()) -> FlightMap:
+def flight_map_of(config: Config, overrides: Sequence[str] = (), *, keep: bool = True) -> FlightMap:
     """Return the flight map that the configuration names, or that of the map that it names.
 
-    `overrides` are those that the configuration was read with.
+    `overrides` are those that the configuration was read with; `keep` for the next start.
 
     Raises:
         ConfigError: where it names none, or files that are not those of the flight map.
@@ -66,7 +66,7 @@ def flight_map_of(config: Config, overrides: Sequence[str] = ()) -> FlightMap:
     if not is_flight_map(path):
         from companion.flight_map.child import compiled
 
-        return compiled(config, table, overrides)
+        return compiled(config, table, overrides, keep=keep)
     try:
         found = read_flight_map(path)
     except MapError as error:

@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 import re
 import sys
+import tomllib
 from pathlib import Path, PurePath
 from typing import Any, Literal
+
+from companion.errors import ConfigError
 
 # What a computer is for: the extras of pyproject.toml.
 Role = Literal["vehicle", "office", "campaign", "cluster"]
@@ -60,6 +63,8 @@ def missing(library: str, role: Role = "office") -> str:
 
 
 VALUE_LENGTH_MAX = 60
+# A page of text; whatever is larger is another file, given by mistake.
+TOML_MAX_BYTES = 1_000_000
 _LINE = re.compile(r"at line (\d+)")
 
 
@@ -69,8 +74,34 @@ def show_value(value: Any, *, length_max: int = VALUE_LENGTH_MAX) -> str:
     return text if len(text) <= length_max else f"{text[: length_max - 4]} ..."
 
 
-def say_syntax(path: Path, text: str, message: str) -> str:
-    """Return one line on a file that is not valid TOML: where, what, and the line itself."""
+def read_toml(path: Path, *, what: str, named: str = "") -> tuple[str, dict[str, Any]]:
+    """Return the text and the tables of a TOML file, which is to be one of `what`.
+
+    Raises:
+        ConfigError: in one line, which begins with `named`, where that is given.
+    """
+    named = named or str(path)
+    fix = f"give the .toml file of {what}"
+    try:
+        with path.open("rb") as file:
+            content = file.read(TOML_MAX_BYTES + 1)
+        if len(content) > TOML_MAX_BYTES:
+            raise ConfigError(f"{named}: too large; {fix}")
+        text = content.decode("utf-8-sig")
+        return text, tomllib.loads(text)
+    except OSError as error:
+        reason = (error.strerror or "cannot be read").lower()
+        raise ConfigError(f"{named}: {reason}; {fix}") from error
+    except UnicodeDecodeError as error:
+        place = f"byte {error.start}"
+        raise ConfigError(f"{named}: not UTF-8 text ({place}); save the file as UTF-8") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(_syntax(path, text, str(error))) from error
+    except RecursionError as error:
+        raise ConfigError(f"{path}: brackets nested too deep; write plain tables") from error
+
+
+def _syntax(path: Path, text: str, message: str) -> str:
     match = _LINE.search(message)
     if match is None:
         advice = "a quote or bracket is not closed at the end of the file"

@@ -19,6 +19,7 @@ from companion.config.model import parse_value
 from companion.errors import ConfigError
 from companion.journal.writer import DECLARED_META
 from companion.simulated import Simulated
+from companion.wording import read_toml
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
 TABLES = ("application", "product")
 # Counts only after the flight: in a configuration it would vouch for every simulation too.
 REAL_FLIGHT = "application.real_flight"
-SIZE_MAX_BYTES = 1_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,16 +139,7 @@ def _flat(document: Mapping[str, Any]) -> dict[str, Any]:
 
 def _read(file: Path) -> dict[str, Any]:
     """Return the entries of a TOML file with the tables [application] and [product]."""
-    try:
-        if file.stat().st_size > SIZE_MAX_BYTES:
-            raise ConfigError(f"{file}: too large; give a .toml file with [application]")
-        document = tomllib.loads(file.read_bytes().decode("utf-8-sig"))
-    except OSError as error:
-        reason = (error.strerror or "cannot be read").lower()
-        raise ConfigError(f"{file}: {reason}; give a .toml file with [application]") from error
-    except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{file}: is not a TOML file: {' '.join(str(error).split())}") from error
-    found = _flat(document)
+    found = _flat(read_toml(file, what="an application")[1])
     if not found:
         raise ConfigError(f"{file}: has neither [application] nor [product]")
     return found

@@ -100,7 +100,7 @@ def problems_of(config: Config, overrides: Sequence[str] = ()) -> list[Problem]:
 def _map_problems(config: Config, overrides: Sequence[str]) -> list[Problem]:
     """Return what keeps the map from being flown, and what the sprayer cannot deliver on it."""
     try:
-        setup = build_setup(config, flight_map_of(config, overrides))
+        setup = build_setup(config, flight_map_of(config, overrides, keep=False))
     except MapError as error:
         return [Problem(**refusal(error))]  # type: ignore[arg-type] # the severity is "error"
     except ConfigError as error:

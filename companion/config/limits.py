@@ -9,7 +9,6 @@ the report. What no sensor on board tells is declared by the operator under [app
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
@@ -24,9 +23,8 @@ from companion.config.wording import findings, one_line
 from companion.core.label import LabelLimits, Span, is_from
 from companion.core.types import Inhibit
 from companion.errors import ConfigError
-from companion.wording import say_syntax
+from companion.wording import read_toml
 
-SIZE_MAX_BYTES = 100_000
 # Where the journal keeps them.
 LIMITS_META = "limits_json"
 DAY = r"^[0-9]{4}-[0-9]{2}-[0-9]{2}$"
@@ -322,23 +320,9 @@ def read_limits(path: Path, named: str) -> LimitsFile:
     Raises:
         ConfigError: in one line: file, key, value, what to write instead.
     """
+    _, raw = read_toml(path, what="label and permit", named=named)
     try:
-        if not path.is_file() or path.stat().st_size > SIZE_MAX_BYTES:
-            reason = "too large for limits" if path.is_file() else "no such file"
-            raise ConfigError(f"{named}: {reason}; give the .toml file of label and permit")
-        text = path.read_bytes().decode("utf-8-sig")
-    except OSError as error:
-        reason = (error.strerror or "cannot be read").lower()
-        raise ConfigError(f"{named}: {reason}; give the .toml file of label and permit") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{named}: not UTF-8 text; save the file as UTF-8") from error
-    try:
-        raw: dict[str, Any] = tomllib.loads(text)
         return LimitsFile.model_validate(raw)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(say_syntax(path, text, str(error))) from error
-    except RecursionError as error:
-        raise ConfigError(f"{path}: brackets nested too deep; write plain tables") from error
     except ValidationError as error:
         raise ConfigError(
             f"{path}: {one_line(findings(error.errors(), raw, LimitsFile))}"

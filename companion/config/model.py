@@ -21,7 +21,7 @@ from companion.core.safety import Limits
 from companion.core.schedule import LagModel
 from companion.core.types import Fix, Method, PwmLimits
 from companion.errors import ConfigError
-from companion.wording import say_syntax, show_value
+from companion.wording import read_toml, show_value
 
 # ---------------------------------------------------------------------------------------- the whole
 
@@ -192,8 +192,6 @@ class Config(Document):
 
 # --------------------------------------------------------------------------------- read from a file
 
-# A configuration is a page of text; whatever is larger is another file, given by mistake.
-SIZE_MAX_BYTES = 1_000_000
 STEP = re.compile(r"([A-Za-z0-9_-]+)((?:\[\d+\])*)")
 
 
@@ -203,13 +201,7 @@ def load(path: Path, *, overrides: Sequence[str] = ()) -> Config:
     Raises:
         ConfigError: in one line: file, key, value, what to write instead.
     """
-    text = _read(path)
-    try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(say_syntax(path, text, str(error))) from error
-    except RecursionError as error:
-        raise ConfigError(f"{path}: brackets nested too deep; write plain tables") from error
+    text, raw = read_toml(path, what="a configuration")
     origins: dict[str, Origin] = {key: "file" for key, _ in leaves(raw)}
     for override in overrides:
         origins.update((key, "override") for key in _apply(raw, override))
@@ -234,21 +226,6 @@ def load(path: Path, *, overrides: Sequence[str] = ()) -> Config:
 
         label = read_limits(path.parent / name, f"{path}: limits.file: {path.parent / name}")
     return config.came_from(path, source_text=text, origins=origins, label=label)
-
-
-def _read(path: Path) -> str:
-    """Return the text of the file."""
-    try:
-        if path.stat().st_size > SIZE_MAX_BYTES:
-            raise ConfigError(f"{path}: too large for a configuration; give the .toml file")
-        return path.read_bytes().decode("utf-8-sig")
-    except OSError as error:
-        reason = (error.strerror or "cannot be read").lower()
-        raise ConfigError(f"{path}: {reason}; give the path of a configuration file") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(
-            f"{path}: not UTF-8 text (byte {error.start}); save the file as UTF-8"
-        ) from error
 
 
 def _apply(raw: dict[str, Any], override: str) -> list[str]:

@@ -48,10 +48,12 @@ _WRITTEN = (0, 1)
 _COMPILER = ("map", "compile")
 
 
-def compiled(config: Config, table: PrescriptionTable, overrides: Sequence[str] = ()) -> FlightMap:
+def compiled(
+    config: Config, table: PrescriptionTable, overrides: Sequence[str] = (), *, keep: bool = True
+) -> FlightMap:
     """Return what was compiled of these very files with these settings, now or before.
 
-    `overrides` are those that the configuration was read with.
+    `overrides` are those that the configuration was read with. What only looks does not `keep` it.
 
     Raises:
         ConfigError, MapError: where a file cannot be used.
@@ -65,20 +67,23 @@ def compiled(config: Config, table: PrescriptionTable, overrides: Sequence[str] 
     found = _still_good(kept, config, table)
     if found is not None:
         return found
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        writable = os.access(folder, os.W_OK)
-    except OSError:
-        writable = False
-    if writable:
+    if keep and _is_writable(folder):
         _compile(config, table, overrides, kept)
         _forget_old(folder)
         return read_flight_map(kept)
-    _logger.warning("%s cannot be written: the map is compiled at every start", folder)
     with tempfile.TemporaryDirectory(prefix="vrspray-") as elsewhere:
         path = Path(elsewhere) / kept.name
         _compile(config, table, overrides, path)
         return read_flight_map(path)
+
+
+def _is_writable(folder: Path) -> bool:
+    with suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK):
+            return True
+    _logger.warning("%s cannot be written: the map is compiled at every start", folder)
+    return False
 
 
 def _still_good(kept: Path, config: Config, table: PrescriptionTable) -> FlightMap | None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import itertools
 import math
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 
 from companion.config import load
 from companion.errors import ConfigError
-from companion.wording import missing, say_syntax
+from companion.wording import missing, read_toml
 from sitl.anyang import EXAMPLE
 from sitl.campaign.settings import (
     NOT_IN_CONDITIONS,
@@ -39,7 +38,6 @@ VERSION = 1
 GRID, HYPERCUBE, SOBOL, MORRIS = "grid", "latin-hypercube", "sobol", "morris"
 KINDS = (GRID, HYPERCUBE, SOBOL, MORRIS)
 FLIGHTS_MAX = 10_000_000
-SIZE_MAX_BYTES = 1_000_000
 MORRIS_LEVELS = 4
 EXAMPLE_CONFIG = EXAMPLE / "config.toml"
 TRIED_MAX = 20
@@ -202,19 +200,7 @@ def read_campaign(path: Path, *, checked: bool = True) -> Campaign:
     Raises:
         ConfigError: in one line: file, key, value, what to write instead.
     """
-    try:
-        content = path.read_bytes()
-        if len(content) > SIZE_MAX_BYTES:
-            raise ConfigError(f"{path}: too large for a campaign; give the .toml file")
-        text = content.decode("utf-8-sig")
-        table = tomllib.loads(text)
-    except OSError as error:
-        reason = (error.strerror or "cannot be read").lower()
-        raise ConfigError(f"{path}: {reason}; give the path of a campaign file") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: not UTF-8 text; save the file as UTF-8") from error
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(say_syntax(path, text, str(error))) from error
+    text, table = read_toml(path, what="a campaign")
     try:
         found = _campaign(path, text, table)
         if checked:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import importlib
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -307,6 +308,15 @@ def test_config_check_accepts_the_example(capsys: Captured) -> None:
     assert "the drone sprays the whole map" in everywhere
     assert "watchdog script is seen" in guarded
     assert "calibrate lag` needs a flow meter" in unmetered
+
+
+def test_config_check_writes_nothing(tmp_path: Path, capsys: Captured) -> None:
+    folder = Path(shutil.copytree(Path(CONFIG).parent, tmp_path / "field"))
+    shutil.rmtree(folder / "state", ignore_errors=True)
+    before = sorted(folder.rglob("*"))
+    assert execute(["config", "check", str(folder / "config.toml")]) == 0
+    capsys.readouterr()
+    assert sorted(folder.rglob("*")) == before
 
 
 def test_config_check_prints_every_problem(capsys: Captured) -> None:
