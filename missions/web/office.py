@@ -59,7 +59,7 @@ MADE_MAP = "made-prescription.gpkg"
 MADE_TRIAL = "made-prescription.trial.geojson"
 # What was planned to be flown, each in a folder of its own where nothing is written again.
 FIELDS_KEPT = 10
-SETTINGS_NAME = "settings.json"
+SETTINGS_NAME, RESULTS_NAME = "settings.json", "results.json"
 PROPOSED_NAME = "field-proposed.json"
 
 Name = Annotated[str, Field(pattern=rf"^{NAME.pattern}$", max_length=80)]
@@ -211,6 +211,13 @@ class Office:
         self.fields = self.given.with_name("fields")
         for part in self.given.parent.glob("*.part"):  # of a page that was ended
             part.unlink(missing_ok=True)
+        # Of the field that is flown, plan and missions are at hand again.
+        kept = self.fields / self.host.flown
+        with suppress(OSError, ValueError):
+            results = json.loads((kept / RESULTS_NAME).read_bytes())
+            shutil.rmtree(self.made, ignore_errors=True)
+            shutil.copytree(kept / "made", self.made)
+            self.results = results
 
     def state(self) -> dict[str, Any]:
         """Return what is there, what was found in it, and why nothing can be done now."""
@@ -357,6 +364,10 @@ class Office:
                 "error": error, "found": found, "flight_map": flight_map,
                 "files": [Path(path).name for path in found.get("files", [])],
             }  # fmt: skip
+            if flight_map is not None and flight_map["error"] is None:
+                kept = self.fields / flight_map["field"]
+                shutil.copytree(self.made, kept / "made", copy_function=_link)
+                (kept / RESULTS_NAME).write_text(json.dumps(self.results), encoding="utf-8")
         return self.state()
 
     async def _planned(self, words: list[str], done: Path | None) -> Outcome:
@@ -496,9 +507,9 @@ def _set(settings: Mapping[str, str]) -> list[str]:
     return [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
 
 
-def _link(path: Path, link: Path) -> None:
+def _link(path: Path | str, link: Path | str) -> None:
     """Give a file one more name; a copy where the disk cannot."""
-    link.unlink(missing_ok=True)
+    Path(link).unlink(missing_ok=True)
     try:
         os.link(path, link)
     except OSError:

@@ -289,6 +289,7 @@ async def test_a_later_plan_writes_over_no_field_and_one_is_flown_by_the_operato
         }
         plans = [(await asked("plan", **wanted, no_spray=["garden.geojson"])).json["plan"]]
         kept = tmp_path / "office" / "fields"
+        before_first = {path.name: path.read_bytes() for path in kept.with_name("made").iterdir()}
         before = {path: path.read_bytes() for path in kept.rglob("*") if path.is_file()}
         # Another boundary under the same name, and another plan.
         await load(site, "boundary.geojson", json.dumps(SQUARE).encode(), **mine)
@@ -327,6 +328,14 @@ async def test_a_later_plan_writes_over_no_field_and_one_is_flown_by_the_operato
         assert refused.status == 409
         assert "prescription.file" in refused.json["detail"]
         assert len(site.orders) == 1
+        newest = {path.name: path.read_bytes() for path in (kept.parent / "made").iterdir()}
+    # Started again with the first field: its plan is shown, and its mission is what is uploaded.
+    async with served(host=host | {"flown": "0001-boundary"}) as site:
+        shown = site.ask("GET", OFFICE).json
+        assert shown["plan"] == plans[0]
+        assert {one["name"] for one in shown["made"]} == newest.keys()
+        mission = kept.parent / "made" / "field.plan"
+        assert mission.read_bytes() == before_first["field.plan"] != newest["field.plan"]
 
 
 async def test_without_leave_of_the_configuration_no_field_is_flown(tmp_path: Path) -> None:

@@ -234,6 +234,8 @@ class Day:
         await expect(note).to_contain_text("Flown now: 0001-drawn-boundary", timeout=60_000)
         assert "the field is 0001-drawn-boundary, chosen on the operator's page" in self.bench.said
         assert not is_open(self.bench)
+        await expect(page.locator("#plan")).to_contain_text("% treated")
+        await expect(page.get_by_role("button", name="Upload field.plan")).to_be_visible()
 
     async def declare(self) -> None:
         """Type what label and permit want to know: before that the sprayer is not ready."""
