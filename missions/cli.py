@@ -44,7 +44,7 @@ from missions.pilot_sheet import (
 )
 from missions.plan import LEAVE_PERCENT, Plan
 from missions.planner import plan_mission
-from missions.prices import Price, lines_warnings, no_choices, overlap_warnings, prices, twice_hint
+from missions.prices import Price, no_choices, overlap_warnings, prices, twice_hint
 from missions.reading import Asked, Task, assumed, read_task
 from missions.reading_fleet import BreakAsked
 from missions.reading_ground import Autopilot, GroundAsked, label_warnings, parse_run_in, parse_wind
@@ -304,7 +304,6 @@ def plan(
             *task.said,
             *by_label,
             *planned.warnings,
-            *lines_warnings(planned, reading.config),
         ),
         wind=task.wind,
         treated=None if is_rest else treated_by(planned, task.rates),
@@ -471,19 +470,22 @@ def _choices(planned: Plan, result: dict[str, Any], prices: list[str], *, asked:
 
 def _once(planned: Plan) -> str:
     """Return that the litres count on valves that close, where they spare any."""
-    return ", treated ground not again, as the litres count" if planned.closes else ""
+    if not planned.closes:
+        return ""
+    coverage = planned.coverage
+    more_l = coverage.overlap_percent / max(coverage.percent, 1.0) * planned.volume_l
+    return f", treated ground not again, as the litres count; without it up to {more_l:.1f} L more"
 
 
 def _lines(planned: Plan, result: dict[str, Any], files: list[Path], task: Task) -> list[str]:
     """Return the plan in words."""
     coverage = planned.coverage
-    minutes = sum(map(planned.airborne_s, planned.sorties)) / 60.0
     where = ", ".join(f"{lat:.6f} {lon:.6f}" for lat, lon in result["depots"])
     least_m = result["least_idle_m"]
     idle = f" (together at least {least_m / 1000:.2f} km, in any order)" if least_m >= 50.0 else ""
     lines = [
         f"{names_of(files)}: {counted(len(planned.sorties), 'sortie')}, {planned.volume_l:.1f} L, "
-        f"{minutes:.0f} min in the air",
+        f"{planned.times}",
         *treated_lines(planned, task.rates, has_runs=task.around.run_in is not None),
         f"covered   {coverage.percent:.2f} % of {ground_text(result)}, "
         f"{coverage.overlap_percent:.2f} % {_TWICE[planned.closes]}, "

@@ -313,7 +313,7 @@ def write_title(figure: Figure, plan: Plan, title: str) -> None:
     )
     figures = (
         f"{plan.field.area_m2 / 1e4:.2f} ha    {plan.volume_l:,.1f} L    "
-        f"{_duration(plan.total_s)} with refills    "
+        f"{plan.times}    "
         f"{counted(count, 'sortie')}    {treated}    "
         f"{doubled} {plan.coverage.overlap_percent:.2f} %    "
         f"ferry {plan.length_m('ferry') / 1e3:.1f} km"
@@ -344,16 +344,6 @@ def write_title(figure: Figure, plan: Plan, title: str) -> None:
 def _ferry(plan: Plan) -> str:
     height_m = plan.settings.ferry_height_m
     return "ferry" if height_m is None else f"ferry or transit {height_m:g} m high"
-
-
-def _duration(seconds: float) -> str:
-    """Return a time with refills in words.
-
-    >>> _duration(5430.0), _duration(240.0)
-    ('1 h 30 min', '4 min')
-    """
-    hours, minutes = divmod(round(seconds / 60.0), 60)
-    return f"{hours} h {minutes:02} min" if hours else f"{minutes} min"
 
 
 def _speeds(plan: Plan) -> tuple[float, float]:

@@ -342,6 +342,14 @@ class Plan:
         """Return the time from the first take-off to the last landing, refills among it."""
         return max(sortie.start_s + self.airborne_s(sortie) for sortie in self.sorties)
 
+    @property
+    def times(self) -> str:
+        """Return how long all sorties fly, and how long that takes with refills, in words."""
+        flown = f"{sum(map(self.airborne_s, self.sorties)) / 60.0:.0f} min in the air"
+        if len(self.sorties) == 1:
+            return flown
+        return f"{flown}, {self.total_s / 60.0:.0f} min to the last landing"
+
     def summary(self) -> dict[str, object]:
         """Return the figures of the plan."""
         total_m = sum(self.length_m(kind) for kind in ("spray", "transit", "ferry"))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from companion.config import Config
 from missions.demand import Rates
 from missions.errors import PlanError
 from missions.layouts import is_small
@@ -91,20 +90,6 @@ def overlap_warnings(
             if closing
             else "allow more to be left with --leave-max"
         ),
-    )
-
-
-def lines_warnings(plan: Plan, config: Config | None) -> tuple[str, ...]:
-    """Return that the litres count on lines that the configuration does not name, where they do."""
-    closes = plan.settings.switch_off_percent is not None and plan.settings.valves
-    share = plan.coverage.overlap_percent / max(plan.coverage.percent, 1.0)
-    mission = None if config is None else config.mission
-    if mission is None or mission.lines is not None or not closes or not share > TWICE_SHARE:
-        return ()
-    more_l = share * plan.volume_l
-    return (
-        "the litres assume valves that close over ground sprayed before, which they do only with "
-        f"mission.lines set; without it up to {more_l:.1f} L more fall, and the tank may run empty",
     )
 
 

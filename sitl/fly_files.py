@@ -153,7 +153,8 @@ def fly_lines(result: dict[str, Any]) -> Iterator[str]:
             f"within 15 % of {drops['wanted_um']:g} um; mean {_number(drops['mean_vmd_um'], 0)} um"
         )
     yield (
-        f"{result['simulated_s']:.0f} s in {result['wall_s']:.2f} s: "
+        f"{result['simulated_s']:.0f} s on the way, take-off and landing apart, in "
+        f"{result['wall_s']:.2f} s: "
         f"{result['times_real_time']:.0f} times real time"
     )
     for text in result["notes"]:

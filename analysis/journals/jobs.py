@@ -67,7 +67,7 @@ def one_job(paths: Sequence[Path]) -> list[Sortie]:
     for each in found:
         sha256 = content_sha256(each.path)
         if sha256 in seen:
-            raise ConfigError(f"{each.path}: is the flight of {seen[sha256]} again; give each once")
+            raise ConfigError(f"{each.path}: the same flight as {seen[sha256]}; name one of them")
         seen[sha256] = each.path
         for what, its, other in zip(
             ("map", "place", "place", "training", "simulation"),

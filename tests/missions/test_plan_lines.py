@@ -128,10 +128,12 @@ def test_the_papers_field_is_planned_and_flown_with_nothing_off_its_lines(
     lines = tmp_path / "field.lines.geojson"
     assert planned["lines_file"] == str(lines)
     own = ["--set", f'mission.lines="{lines}"']
-    assert any("only with mission.lines set" in each for each in planned["warnings"])
-    named = [*own, "--out", str(tmp_path / "again.plan"), "--json", *kept]
-    execute(["plan", str(BOUNDARY), "--config", EXAMPLE, *named])
-    assert "mission.lines" not in str(json.loads(capsys.readouterr().out)["warnings"])
+    # What to do with the lines is said where they are named: no warning that every first plan has.
+    assert "mission.lines" not in str(planned["warnings"])
+    execute(["plan", str(BOUNDARY), "--config", EXAMPLE, "--out", str(tmp_path / "b.plan"), *kept])
+    told = capsys.readouterr()
+    assert "as the litres count; without it up to 0." in told.out
+    assert "mission.lines" not in told.err
     execute(["config", "check", EXAMPLE, "--json", *own])
     assert "mission.lines" not in str(json.loads(capsys.readouterr().out)["notes"])
     # The flight map, and with it every journal, names the plan's job; lines of before had none.

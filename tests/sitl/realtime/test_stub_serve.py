@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from sitl.cli import app
+from companion.cli.app import execute
 from sitl.stub.protocol import dialect
 from tests.companion.wire_peer import free_port
 from tests.sitl.realtime.test_stub_links import Client, udp_client
 
 pytestmark = pytest.mark.sitl
+Captured = pytest.CaptureFixture[str]
 
 MISSION = (
     "QGC WPL 110\n"
@@ -173,19 +173,19 @@ WRONG = (
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_wrong_input_is_told_in_one_line(tmp_path: Path, wrong: str) -> None:
+def test_wrong_input_is_told_in_one_line(tmp_path: Path, wrong: str, capsys: Captured) -> None:
     options, said = options_refused(tmp_path)[wrong]
-    refused(said, *options)
+    refused(capsys, said, *options)
 
 
-def test_a_port_in_use_is_told_in_one_line() -> None:
+def test_a_port_in_use_is_told_in_one_line(capsys: Captured) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
-        refused("in use", "--link", f"udpin:127.0.0.1:{taken.getsockname()[1]}")
+        refused(capsys, "in use", "--link", f"udpin:127.0.0.1:{taken.getsockname()[1]}")
 
 
-def refused(said: str, *options: str) -> None:
-    result = CliRunner().invoke(app, ["serve", "--json", *options])
-    assert result.exit_code == 2, result.output
-    assert said in json.loads(result.stdout)["error"]
-    assert len(result.stderr.strip().splitlines()) == 1
+def refused(capsys: Captured, said: str, *options: str) -> None:
+    assert execute(["sitl", "serve", "--json", *options]) == 2
+    told = capsys.readouterr()
+    assert said in json.loads(told.out)["error"]
+    assert len(told.err.strip().splitlines()) == 1
