@@ -74,6 +74,14 @@ def show_value(value: Any, *, length_max: int = VALUE_LENGTH_MAX) -> str:
     return text if len(text) <= length_max else f"{text[: length_max - 4]} ..."
 
 
+def refuse_existing(path: Path, *, force: bool, option: str = "--out") -> None:
+    """Refuse to replace a file that nobody said to replace."""
+    if path.exists() and not force:
+        raise ConfigError(
+            f"{path}: is there already; give another {option}, or --force to replace it"
+        )
+
+
 def read_toml(path: Path, *, what: str, named: str = "") -> tuple[str, dict[str, Any]]:
     """Return the text and the tables of a TOML file, which is to be one of `what`.
 

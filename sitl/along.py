@@ -586,7 +586,8 @@ def _limits(rows: list[dict[str, Any]]) -> str:
     (_, best), (turn, _), (straight, _), (cannot, _) = found
     return (
         f"{best} % is the sprayer's own error, which perfect knowledge of the flight leaves too; "
-        f"vrspray misapplied {straight} %{'' if turn == '-' else f', and {turn} % in turns'}; "
+        f"vrspray misapplied {straight} %"
+        f"{'' if turn == '-' else f' outside turns, {turn} % in turns'}; "
         f"{cannot} % of the volume is not counted: there the vehicle was too slow or too fast, or "
         "pivoted back over it"
     )

@@ -17,6 +17,7 @@ import shapely
 from numpy.typing import NDArray
 
 from companion.errors import VrsprayError
+from companion.wording import refuse_existing
 
 if TYPE_CHECKING:
     from shapely import MultiPolygon, Polygon
@@ -39,9 +40,8 @@ def check_free(out: Path, names: Iterable[str], *, force: bool) -> None:
     """Refuse a destination that is there already, or whose folder is not."""
     if not out.parent.is_dir():
         raise ExportError(f"{out.parent}: there is no such folder; make it first")
-    there = next((name for name in names if (out.parent / name).exists()), None)
-    if there is not None and not force:
-        raise ExportError(f"{out.parent / there}: is there already; give --force to replace it")
+    for name in names:
+        refuse_existing(out.parent / name, force=force)
 
 
 def write_beside(out: Path, content: Content, *, force: bool) -> int:

@@ -24,7 +24,7 @@ from companion.cli.app import refusal
 from companion.config import Config, load
 from companion.config.rules import mismatches, remarks, without_effect
 from companion.errors import ConfigError, MapError, Problem
-from companion.wording import show_value
+from companion.wording import refuse_existing, show_value
 
 if TYPE_CHECKING:
     from companion.cli.new_config import Answers
@@ -154,8 +154,7 @@ def new(
     """
     from companion.cli import new_config
 
-    if out.exists() and not force:
-        raise ConfigError(f"{out}: is there already; give another --out, or --force to replace it")
+    refuse_existing(out, force=force)
     if profile is not None:
         text = new_config.profile_text(
             new_config.read_profile(profile),

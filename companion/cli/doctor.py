@@ -283,7 +283,9 @@ def _guard(config: Config) -> Check:
     if config.output.kind != "servo":
         return not_applicable("output-guard", "no servo outputs are used")
     text, fix = without_power(config)
-    return warn("output-guard", text, fix) if fix else ok("output-guard", text)
+    if fix:
+        return warn("output-guard", text, fix)
+    return (ok if config.output.dither_us else not_applicable)("output-guard", text)
 
 
 def _dead_man(config: Config) -> Check:

@@ -30,13 +30,13 @@ GUARDS = ("script", "board", "none")
 UNSAID = ""
 _GUARD_LINES = {
     "script": """\
-# ArduPilot's watchdog script closes the valves when this computer loses power; install it
+# ArduPilot's watchdog script closes the valves when this computer or its link is lost; install it
 # (deploy/ardupilot). Without it nothing is sprayed.
 guard = "auto"
 """,
     "board": """\
-# The driver board closes its valve when the signal stops moving, as when this computer loses power;
-# test it. The signal moves by dither_us.
+# The driver board closes its valve when the signal stops moving, as when this computer or its link
+# is lost; test it. The signal moves by dither_us.
 guard = "auto"
 dither_us = 8
 """,
@@ -46,7 +46,7 @@ dither_us = 8
 guard = "auto"
 """,
     "none": """\
-# Nothing closes the valves when this computer loses power: keep a hand at the pump switch.
+# Nothing closes the valves when this computer or its link is lost: keep a hand at the pump switch.
 guard = "none-on-power-loss"
 """,
 }
@@ -121,7 +121,8 @@ def ask_all(
     )
     answers = asked(
         "2. Valves on: servo or gpio, the first output, and of servo what closes them when this "
-        "computer loses power: script (ArduPilot's watchdog), board (sees alive dither), or none",
+        "computer or its link is lost: script (ArduPilot's watchdog), board (sees alive dither), "
+        "or none",
         " ".join(_outputs(answers)),
         _with_outputs,
         answers,

@@ -299,12 +299,12 @@ def remarks(config: Document) -> Rule:
 
 
 def without_power(config: Document) -> tuple[str, str]:
-    """Return what closes servo outputs when this computer loses power; if nothing does, advice."""
+    """Return what closes servo outputs without this computer or its link; if nothing, advice."""
     if config.output.dither_us:
-        return "without power the driver board closes the valves (output.dither_us)", ""
+        return "without power or link the driver board closes the valves (output.dither_us)", ""
     if config.output.guard != "auto":
         return (
-            "nothing closes the valves when this computer loses power",
+            "nothing closes the valves when this computer loses power or its link",
             "keep a hand at the pump switch",
         )
     if config.mission is not None and config.mission.autopilot == "px4":
@@ -312,7 +312,11 @@ def without_power(config: Document) -> tuple[str, str]:
             "PX4 has no watchdog script, so nothing will be sprayed",
             'fit a driver board and set output.dither_us, or write "none-on-power-loss"',
         )
-    return "nothing sprays until ArduPilot's watchdog script is seen: it closes without power", ""
+    return (
+        "nothing sprays until ArduPilot's watchdog script is seen on the vehicle: it closes "
+        "without power or link",
+        "",
+    )
 
 
 def unbounded(config: Document) -> Rule:

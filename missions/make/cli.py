@@ -24,7 +24,7 @@ from companion.cli.answer import (
 from companion.config import load
 from companion.errors import Problem
 from companion.flight_map import is_flight_map
-from companion.wording import counted, lack_of
+from companion.wording import counted, lack_of, refuse_existing
 from missions.errors import PlanError
 from missions.make.classes import Method
 from missions.make.cleaning import STEPS, Step
@@ -326,8 +326,7 @@ def _check_cleaned(cleaned: Path | None, data: Sequence[Path], *, force: bool) -
         raise typer.BadParameter(f"--cleaned is written as {' or '.join(POINT_SUFFIXES)}")
     if cleaned in data:
         raise PlanError(f"{cleaned}: --cleaned would replace the data; give another name")
-    if cleaned.exists() and not force:
-        raise PlanError(f"{cleaned}: exists; another --cleaned, or --force to replace it")
+    refuse_existing(cleaned, force=force, option="--cleaned")
 
 
 def _points_of(read: Sequence[Values], data: Sequence[Path]) -> Points:

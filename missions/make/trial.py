@@ -28,7 +28,7 @@ from companion.cli.answer import (
 )
 from companion.config import load
 from companion.map_formats import geojson_feature, geojson_text
-from companion.wording import counted
+from companion.wording import counted, refuse_existing
 from missions.errors import PlanError
 from missions.make.flown import (
     MARGIN,
@@ -270,8 +270,7 @@ def trial(
     writer = writer_for(target, format_name)
     for path in (out, *([] if png is None else [png])):
         check_folder(path)
-    if record.exists() and not force:
-        raise PlanError(f"{record}: exists; another --out, or --force to replace it")
+    refuse_existing(record, force=force)
     treatments = _treatments(rates, check)
     field = flown_field(config, no_spray or [], angle_deg, "swath")
     limits = limits_of(config, field.sprayer, margin)

@@ -14,7 +14,7 @@ from typer.core import TyperGroup
 
 from companion.cli.answer import AsJson, answer, new_app, note, progress
 from companion.errors import ConfigError, StoppedError
-from companion.wording import counted
+from companion.wording import counted, refuse_existing
 
 if TYPE_CHECKING:
     from typer._click.core import Context
@@ -238,6 +238,7 @@ def show(
         Path | None,
         typer.Option(metavar="FILE", help="Write the tables: .csv, .tex or .parquet."),
     ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing --out.")] = False,
     plots: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Draw the pictures into this folder.")
     ] = None,
@@ -263,6 +264,8 @@ def show(
     )
     from sitl.campaign.show import as_json as shown_json
 
+    if out is not None:
+        refuse_existing(out, force=force)
     rows = read_rows(folder, tuple(dict.fromkeys(figure or SHOWN)))
     groups, found = groups_of(rows, by or ()), sensitivity_of(rows)
     differences = differences_of(rows, by or ())

@@ -48,6 +48,8 @@ SHOWN = (
 # More values of a setting than these are shown in so many bins.
 VALUES_MAX, BINS = 12, 6
 CONFIDENCE = 0.95
+# Over fewer an interval is several times as wide as over ten, and its width is chance.
+SEEDS_MIN = 5
 
 
 def least_of(figure: str) -> float:
@@ -139,8 +141,7 @@ class Rows:
     def by_point(self, values: Floats, chosen: NDArray[np.bool_]) -> Floats:
         """Return the mean of each setting among the chosen rows; NaN where no flight has one."""
         table = _table(self.point[chosen], self.seed[chosen], values[chosen])
-        count = (~np.isnan(table)).sum(axis=1)
-        means: Floats = np.where(count, np.nansum(table, axis=1) / np.maximum(count, 1), np.nan)
+        means: Floats = np.ma.masked_invalid(table).mean(axis=1).filled(np.nan)
         return means
 
 
@@ -365,7 +366,7 @@ def tables_of(groups: Sequence[Group]) -> Iterator[list[tuple[str, ...]]]:
     for each in groups:
         name = each.setting if each.against is None else f"{each.setting}, beyond {each.against}"
         names = (*each.within, name, "flights")
-        rows = tables.setdefault(names, [(*names, *(_heading(name) for name in each.figures))])
+        rows = tables.setdefault(names, [(*names, *each.figures)])
         cells = (_cell(found) for found in each.figures.values())
         rows.append((*each.within.values(), each.value, str(each.flights), *cells))
     yield from tables.values()
@@ -418,10 +419,6 @@ def _latex(table: Sequence[Sequence[str]]) -> str:
     columns = "l" + "r" * (len(table[0]) - 1)
     lines = [rf"\begin{{tabular}}{{{columns}}}", r"\hline", head, r"\hline", *rows, r"\hline"]
     return "\n".join([*lines, r"\end{tabular}", ""])
-
-
-def _heading(figure: str) -> str:
-    return figure.replace("_distance", "").replace("spraying_", "")
 
 
 def _cell(found: Estimate | None) -> str:
@@ -506,8 +503,10 @@ def sensitivity_of(rows: Rows) -> list[Index]:
 def notes_of(rows: Rows, found: Sequence[Index]) -> Iterator[str]:
     """Yield why figures have no sensitivity, and why indices have no interval."""
     campaign = rows.campaign
-    if len(campaign.seeds) == 1:
-        yield "one seed: no intervals; write seeds = 10, then run it again with the same --out"
+    if len(campaign.seeds) < SEEDS_MIN:
+        few = f"intervals over {len(campaign.seeds)} seeds mean little"
+        few = few if len(campaign.seeds) > 1 else "one seed: no intervals"
+        yield f"{few}; write seeds = 10, then run it again with the same --out"
     if found and not _has_interval(rows):
         needed = SAMPLES_FOR_INTERVAL[campaign.kind]
         yield (

@@ -76,7 +76,7 @@ def test_a_folder_is_made_and_replaced_whole(
     assert execute(given) == 0
     before = names(out / "made")
     assert execute(given) == 2
-    assert "give --force" in capsys.readouterr().err
+    assert "or --force to replace it" in capsys.readouterr().err
     assert execute([*given, "--force"]) == 0
     assert names(out / "made") == before
     (out / "made" / "mine.txt").write_text("kept")
@@ -149,7 +149,7 @@ def test_nothing_is_written_over_without_being_told_to(
     (out / beside).write_text("mine")
     given = ["export", str(journal), "--out", str(out / name)]
     assert execute(given) == 2
-    assert f"{beside}: is there already; give --force" in capsys.readouterr().err
+    assert f"{beside}: is there already; give another --out, or --force" in capsys.readouterr().err
     assert (out / beside).read_text() == "mine"
     assert names(out) == {beside}
     assert execute([*given, "--force"]) == 0

@@ -110,9 +110,9 @@ def test_what_is_no_job_is_refused_in_a_line(folder: Path, meta: dict[str, str],
 def test_a_journal_is_taken_once_under_whatever_name(folder: Path) -> None:
     again = folder / "copy.gpkg"
     shutil.copy(folder / "flight-0001.gpkg", again)
-    with pytest.raises(ConfigError, match="again"):
+    with pytest.raises(ConfigError, match="the same flight as"):
         one_job([folder / "flight-0001.gpkg", again])
-    with pytest.raises(ConfigError, match="again"):
+    with pytest.raises(ConfigError, match="the same flight as"):
         one_job([folder / "flight-0001.gpkg"] * 2)
 
 

@@ -166,7 +166,7 @@ CONDITIONS: dict[Inhibit, tuple[str, str, str, str]] = {
         "when the vehicle is heard again",
     ),
     Inhibit.UNGUARDED: (
-        'with `output.guard = "auto"`: something closes servo outputs when the companion loses power: '
+        'with `output.guard = "auto"`: something closes servo outputs when the companion loses power or its link: '
         "`SPRW_ENABLE` is 1, or `output.dither_us` is set", "PARAM_VALUE", "-", "at once",
     ),
     Inhibit.LEAK: ("no flow while all valves are closed", *_LIQUID),

@@ -435,7 +435,7 @@ def test_sensitivity_finds_the_setting_that_matters(
     campaign = read_campaign(
         write_campaign(
             tmp_path,
-            f'seeds = 2\n[design]\nkind = "{kind}"\nsamples = 128\n'
+            f'seeds = 5\n[design]\nkind = "{kind}"\nsamples = 128\n'
             '[[vary]]\nset = "vehicle.gust_m_s"\nlow = 0.0\nhigh = 3.0\n'
             '[[vary]]\nset = "vehicle.gust_time_s"\nlow = 1.0\nhigh = 3.0\n',
         )
@@ -476,7 +476,9 @@ def test_too_few_samples_give_no_interval_and_say_so(
     )
     found = sensitivity_of(rows)
     assert found and all((each.low, each.high) == (None, None) for each in found)
-    assert list(notes_of(rows, found)) == [
+    few, too_few = notes_of(rows, found)
+    assert few.startswith("intervals over 2 seeds mean little; write seeds = 10")
+    assert [too_few] == [
         f"no intervals of sensitivity: {samples} samples are too few for a {kind} design; write "
         f"design.samples = {needed} or more"
     ]
