@@ -54,7 +54,7 @@ COLUMNS = (
     Column("training", "text", "`no` for a product, `water`, `dry`, `simulated`"),
     Column("simulated", "text", "`yes`, `no`, or `unknown`"),
     Column("started_utc", "time", "start of the record"),
-    Column("utc_source", "text", "whose clock: `autopilot`, or `computer`"),
+    Column("utc_source", "text", "whose clock: `autopilot`, else `autopilot-jumped` or `computer`"),
     Column("duration_s", "number", "of the record"),
     Column("spraying_s", "number", "with a valve open"),
     Column("latitude_deg", "number", "of the field's origin, to 10 m"),

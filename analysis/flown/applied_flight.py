@@ -20,6 +20,7 @@ from companion.journal.writer import Event
 from companion.receiver import ReceiverOffset
 from companion.simulated import Simulated, simulated_in
 
+ClockSource = Literal["autopilot", "autopilot-jumped", "computer"]
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
@@ -66,7 +67,7 @@ class AppliedFlight:
     lost: int
     events: tuple[Event, ...]
     utc_offset_s: float
-    utc_source: Literal["autopilot", "computer"]
+    utc_source: ClockSource
     time_s: Floats
     latitude_deg: Floats
     longitude_deg: Floats

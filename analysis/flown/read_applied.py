@@ -15,12 +15,12 @@ from dataclasses import replace
 from functools import lru_cache, partial
 from operator import methodcaller
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.flown.applied_flight import AppliedFlight, Floats, Ints, ValveChanges
+from analysis.flown.applied_flight import AppliedFlight, ClockSource, Floats, Ints, ValveChanges
 from analysis.flown.holes import (
     Hole,
     change_holes,
@@ -293,8 +293,8 @@ def _mended(
     )
 
 
-def _source(text: str) -> Literal["autopilot", "computer"]:
-    return "autopilot" if text == "autopilot" else "computer"
+def _source(text: str) -> ClockSource:
+    return next((each for each in get_args(ClockSource) if each == text), "computer")
 
 
 def _at_start(meta: dict[str, str]) -> list[str]:

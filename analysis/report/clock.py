@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 PLAUSIBLE_FROM = datetime(2024, 1, 1, tzinfo=UTC)
 SOURCES = {
     "autopilot": "clock of the autopilot (UTC from its satellite receiver)",
+    "autopilot-jumped": "clock of the autopilot, which jumped in flight, not verified",
     "computer": "clock of the companion, not verified",
     "operator": "given by the operator",
 }
@@ -34,7 +35,7 @@ class Clock:
     @property
     def is_verified(self) -> bool:
         """Return whether somebody vouches for the time: the autopilot, or the operator."""
-        return self.source != "computer"
+        return self.source in ("autopilot", "operator")
 
     @property
     def source_text(self) -> str:

@@ -400,7 +400,7 @@ def _journal(flight: AppliedFlight, clock: Clock) -> Iterator[Caution]:
     if flight.lost:
         yield _warning("rows-lost", f"{flight.lost} rows of the journal are lost.")
     if not clock.is_verified:
-        yield _warning("clock", "Times are by the clock of the companion, which was not verified.")
+        yield _warning("clock", f"Times are by the {clock.source_text}.")
 
 
 def _wind(flight: AppliedFlight) -> Iterator[Caution]:

@@ -22,6 +22,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+from analysis.report.clock import SOURCES
 from analysis.report.legal_fields import FIELDS, LABELS, REAL_FLIGHT, Facts, label_of
 from companion.config.application_table import Profile, is_told
 from companion.config.legal_entries import ASKED, missing
@@ -254,10 +255,10 @@ def _remarks(told: Told, facts: Facts) -> Iterator[str]:
         if facts.volume_by == "flow meter" and facts.modelled_l is not None:
             beside = f"; by the model of the executed changes {facts.modelled_l:.3f} L"
         yield f"quantities are by the {facts.volume_by}{beside}"
-    if facts.clock_source == "computer":
-        yield "times are by the clock of the companion, not verified"
     if facts.clock_source == "operator":
         yield "times are as the operator gave them"
+    elif facts.clock_source != "autopilot":
+        yield f"times are by the {SOURCES[facts.clock_source]}"
     if not facts.is_closed:
         yield "the journal was cut; up to its last second may be missing"
     if facts.wind_note:

@@ -175,8 +175,8 @@ def line_of(flight: Flight) -> str:
     shown = as_object(flight)
     started = shown["started_utc"]
     date = "date unknown" if started is None else f"{started[:19].replace('T', ' ')} UTC"
-    if flight.utc_source == "computer":
-        date += " (by this computer)"
+    if flight.utc_source != "autopilot":
+        date += " (by this computer)" if flight.utc_source == "computer" else " (not verified)"
     parts = [flight.path.name, date]
     if flight.duration_s is not None:
         parts.append(f"{flight.duration_s / 60.0:.1f} min")

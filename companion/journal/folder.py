@@ -319,7 +319,7 @@ def _removed(removal: Removal) -> Removal | None:
 
 # ------------------------------------------------------------------------------------ after a crash
 
-_KNOWN = "SELECT min(time_s) FROM events WHERE kind = 'clock'"
+_KNOWN = "SELECT max(time_s) FROM events WHERE kind = 'clock'"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -473,7 +473,7 @@ def _looked_at(path: Path) -> tuple[bool, _Ending | None]:
 def _ending(connection: sqlite3.Connection, meta: Mapping[str, str]) -> _Ending:
     (known_s,) = connection.execute(_KNOWN).fetchone()
     offset = meta.get("utc_offset_s")
-    is_known = meta.get("utc_source") == "autopilot" and known_s is not None and offset is not None
+    is_known = meta.get("utc_source") != "computer" and known_s is not None and offset is not None
     return _Ending(
         box=box_of_points(connection, "applied"),
         time=(float(offset or "nan"), float(known_s)) if is_known else None,

@@ -493,35 +493,64 @@ def _short(values: Sequence[float | None]) -> str:
 
 # What differs by more is another time, and not the way of a message.
 JUMP_S = 1.0
+# So many times of day are counted; one that reports name seldom gives way.
+TIMES_MAX = 8
+
+
+@dataclass(slots=True, eq=False)
+class _Time:
+    offset_s: float
+    reports: int = 0
 
 
 class FlightClock:
     """Makes a time since 1970 of the companion's monotonic one.
 
     Of the autopilot's reports the one counts that was shortest on its way: delays only ever make
-    its clock look slow.
+    its clock look slow. Where its time jumps, as at the end of a week of GPS, that time counts
+    which most of its reports name, and nobody vouches for it.
     """
 
     def __init__(self, offset_s: float) -> None:
         self.offset_s = offset_s
         self.source = "computer"
-        self.known_s: float | None = None
+        self.known_s: float | None = None  # what was written before gets its time at the end
+        self._times: list[_Time] = []
+        self._last = _Time(offset_s)
 
     def take(self, report: UtcReport) -> str | None:
         """Take a report; return what is to be said of it, None where it only agrees."""
         offset_s = report.utc_s - report.received_s
         if not abs(offset_s) < float("inf"):
             return None
-        apart_s = offset_s - self.offset_s
+        before, own = self._last, self._time_of(offset_s)
+        own.reports += 1
+        used = max(self._times, key=lambda each: each.reports)
+        said = None
         if self.known_s is None:
-            self.offset_s, self.source, self.known_s = offset_s, "autopilot", report.received_s
-            text = time_text(report.utc_s)
-            return f"the autopilot says {text}; this computer's clock was {-apart_s:+.1f} s off"
-        if abs(apart_s) > JUMP_S:
-            self.offset_s = offset_s
-            return f"the autopilot's time of day jumped by {apart_s:+.1f} s"
-        self.offset_s = max(self.offset_s, offset_s)
-        return None
+            self.source, text = "autopilot", time_text(report.utc_s)
+            off_s = self.offset_s - offset_s
+            said = f"the autopilot says {text}; this computer's clock was {off_s:+.1f} s off"
+        elif own is not before:
+            self.source = "autopilot-jumped"
+            said = f"the autopilot's time of day jumped by {own.offset_s - before.offset_s:+.1f} s"
+        elif abs(used.offset_s - self.offset_s) > JUMP_S:
+            said = f"most of the autopilot's reports say {time_text(report.utc_s)}"
+        if said is not None:
+            self.known_s = report.received_s
+        self._last, self.offset_s = own, used.offset_s
+        return said
+
+    def _time_of(self, offset_s: float) -> _Time:
+        """Return the time of day that a report names, by its offset."""
+        for each in self._times:
+            if abs(offset_s - each.offset_s) <= JUMP_S:
+                each.offset_s = max(each.offset_s, offset_s)
+                return each
+        if len(self._times) == TIMES_MAX:
+            self._times.remove(min(self._times, key=lambda each: each.reports))
+        self._times.append(_Time(offset_s))
+        return self._times[-1]
 
     def text(self, at_s: float) -> str | None:
         """Return a monotonic time as UTC; None for what is no time."""

@@ -177,9 +177,10 @@ def test_some_flights_make_no_complete_record_whatever_is_said(
     assert any(text in reason for reason in record.missing)
 
 
-def test_a_clock_that_nobody_verified_is_said(flight: AppliedFlight) -> None:
+@pytest.mark.parametrize("source", ["computer", "autopilot-jumped"])
+def test_a_clock_that_nobody_verified_is_said(flight: AppliedFlight, source: str) -> None:
     facts = facts_of(
-        flight, treated_of(flight), clock("computer"), volume_l=0.5, volume_by="", prescribed_l=0.5
+        flight, treated_of(flight), clock(source), volume_l=0.5, volume_by="", prescribed_l=0.5
     )
     record = legal_record("eu", told_with(META), facts)
     assert "not verified" in record.as_json()["fields"]["start_time"]["said"]

@@ -14,7 +14,7 @@ from companion.core.types import SprayPlan, TimedChange, UtcReport
 from companion.journal.folder import look_at
 from companion.journal.journal import Journal
 from companion.journal.rows import ValveOrder, ValveRows
-from companion.journal.writer import FlightClock
+from companion.journal.writer import TIMES_MAX, FlightClock
 from companion.link.codec import FROM_VEHICLE
 from companion.output.engine.wire import Issued
 from companion.output.gpio import GpioExecutor
@@ -162,6 +162,59 @@ def test_of_messages_on_their_way_the_fastest_counts_and_a_jump_is_told() -> Non
     assert said is not None
     assert "jumped by +99.9 s" in said
     assert clock.take(UtcReport(received_s=14.0, utc_s=math.nan)) is None
+
+
+WEEK_S = 604_800.0
+
+
+def told(clock: FlightClock, *, seconds: range, off_s: float = 0.0) -> list[str]:
+    said = [clock.take(UtcReport(received_s=s, utc_s=UTC_S + s + off_s)) for s in seconds]
+    return [text for text in said if text is not None]
+
+
+def test_a_week_that_rolls_back_at_the_end_does_not_date_the_flight() -> None:
+    clock = FlightClock(0.0)
+    told(clock, seconds=range(600))
+    said = told(clock, seconds=range(600, 700), off_s=-WEEK_S)
+    assert said == ["the autopilot's time of day jumped by -604800.0 s"]
+    assert clock.offset_s == UTC_S
+    assert clock.source == "autopilot-jumped"
+
+
+def test_a_time_that_is_put_right_early_dates_the_flight() -> None:
+    clock = FlightClock(0.0)
+    told(clock, seconds=range(5), off_s=-WEEK_S)
+    assert clock.offset_s == UTC_S - WEEK_S
+    said = told(clock, seconds=range(5, 100))
+    assert "jumped by +604800.0 s" in said[0]
+    assert said[1].startswith("most of the autopilot's reports say 2026-03-21")
+    assert (clock.offset_s, clock.source, clock.known_s) == (UTC_S, "autopilot-jumped", 10)
+
+
+def test_times_without_end_are_counted_within_bounds() -> None:
+    clock = FlightClock(0.0)
+    told(clock, seconds=range(20))
+    for number in range(1, 500):
+        told(clock, seconds=range(20, 22), off_s=-100.0 * number)
+    assert clock.offset_s == UTC_S
+    assert len(clock._times) == TIMES_MAX
+
+
+@pytest.mark.parametrize("wrong", [range(3), range(8, 11)])
+def test_rows_of_a_flight_whose_time_jumped_have_the_time_that_counts(
+    wrong: range, tmp_path: Path
+) -> None:
+    with Journal.create(tmp_path, setup=setup(), started_s=9.0) as journal:
+        for number, decision in enumerate(decisions(110)):
+            if number % 10 == 0:
+                off_s = -WEEK_S if number // 10 in wrong else 0.0
+                at_s = decision.now_s
+                journal.record_input(UtcReport(received_s=at_s, utc_s=UTC_S + at_s + off_s))
+            journal.record_decision(decision)
+    for table in ("applied", "events"):
+        ((first, last),) = query(journal.path, f"SELECT min(time), max(time) FROM {table}")
+        assert first.startswith("2026-03-21") and last.startswith("2026-03-21"), table
+    assert look_at(journal.path).utc_source == "autopilot-jumped"
 
 
 def test_what_was_written_before_gets_the_autopilot_s_time_at_the_end(tmp_path: Path) -> None:

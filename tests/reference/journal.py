@@ -59,7 +59,7 @@ META: dict[str, str] = {
     "closed": "`yes` after an orderly end, `recovered` after a cut, `salvaged` in a copy of a damaged file",
     "lost": "rows that are not in the file",
     "started_utc, started_s": "start of the flight, by UTC and by `time_s`",
-    "utc_source, utc_offset_s": "`autopilot` or `computer`; what to add to `time_s` for seconds since 1970",
+    "utc_source, utc_offset_s": "`autopilot`, `autopilot-jumped` or `computer`; what to add to `time_s` for seconds since 1970",
     "training": "what was sprayed: `no` a product, `water`, `dry` nothing, `simulated` nothing",
     "simulated, simulated_because": "whether the flight was simulated: `yes`, `no` or `unknown`, and what told; absent in older journals",
     "applied_l": "litres that the ordered duties stand for",
