@@ -14,6 +14,7 @@ from io import StringIO
 from typing import TYPE_CHECKING
 
 from companion.errors import VrsprayError
+from companion.wording import iconv
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -137,4 +138,4 @@ def _text(path: Path) -> str:
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise TableError(f"{path}: this is not text in UTF-8; save it as CSV in UTF-8") from None
+        raise TableError(f"{path}: this is not text in UTF-8; {iconv(content, path)}") from None

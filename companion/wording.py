@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import sys
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path, PurePath
 from typing import Any, Literal
 
@@ -25,6 +27,32 @@ def counted(count: int, name: str) -> str:
     """
     plural = "es" if name.endswith("s") else "s"
     return f"{count} {name}{'' if count == 1 else plural}"
+
+
+def typed(names: Iterable[str]) -> str:
+    """Return names as a shell takes them, one after the other: with quotes where they need them.
+
+    >>> typed(["DOSE", "rate (L/ha)", "用量"])
+    "DOSE, 'rate (L/ha)', 用量"
+    """
+    return ", ".join(
+        name if re.fullmatch(r"[\w./:@+=-]+", name) else shlex.quote(name) for name in names
+    )
+
+
+def iconv(content: bytes, path: Path) -> str:
+    """Return the command that makes UTF-8 of a text, from what its first bytes show that it is.
+
+    >>> iconv("one".encode("utf-16"), Path("my map.csv"))
+    "iconv -f UTF-16 -t UTF-8 'my map.csv' > 'my map-utf8.csv'"
+    """
+    shown = "WINDOWS-1252"
+    if not any(content[1:100:2]) or not any(content[:100:2]):
+        shown = "UTF-16LE" if content[:1].strip(b"\0") else "UTF-16BE"
+    marks = {b"\xff\xfe\0\0": "UTF-32", b"\xff\xfe": "UTF-16", b"\xfe\xff": "UTF-16"}
+    shown = next((name for mark, name in marks.items() if content.startswith(mark)), shown)
+    files = (shlex.quote(str(one)) for one in (path, path.with_stem(f"{path.stem}-utf8")))
+    return f"iconv -f {shown} -t UTF-8 {' > '.join(files)}"
 
 
 def install_command(role: Role, prefix: str = sys.prefix) -> str:

@@ -104,9 +104,8 @@ def map_of(
     """Return the map that a file holds, or refuse what is ambiguous in it."""
     if isinstance(found, Grid):
         return _map_of_grid(found, path, rate_field=rate_field, crs=crs, given=given)
-    if not found.geometries:
-        raise map_error(path, "it has no records", fix="export the zones again", code="no-polygon")
     used_crs, crs_problems = crs_of(found, path, crs)
+    _polygons(found, path)
     if not found.columns:
         raise map_error(
             path,
@@ -116,7 +115,8 @@ def map_of(
             else "export it again with the rate as an attribute",
             code="no-rate-column",
         )
-    choice = choose(found.columns, asked=rate_field, path=path)
+    areas = shapely.area(np.array(found.geometries, dtype=object))
+    choice = choose(found.columns, asked=rate_field, path=path, areas=areas)
     unit = unit_of(found, choice.column, given=given, path=path)
     names = zone_names(found)
     rates = _rates(choice.column, unit, names, path)
@@ -161,7 +161,9 @@ def _map_of_grid(
         wrong = ~np.isnan(rates) & ~((rates >= 0.0) & (rates < RATE_MAX_L_HA))
     if wrong.any():
         row, column = np.argwhere(wrong)[0].tolist()
+        line_of = choice.column.line_of
         where = f"row {row + 1}, column {column + 1}"
+        where = where if line_of is None else f"line {line_of(row, column)}"
         raise _bad_rate(path, choice.column, where, float(choice.column.values[row, column]))
     cells = MapCells(rates_l_ha=rates, transform=found.transform, crs=used_crs)
     check_place(cells, path)
@@ -287,16 +289,7 @@ def ground_of(
     layer: Layer, crs: CRS, names: Sequence[str], path: Path
 ) -> tuple[list[Area | None], list[Repair]]:
     """Return every record's ground in longitude and latitude, repaired where rings cross."""
-    here = [index for index, area in enumerate(layer.geometries) if area is not None]
-    if not here:
-        kinds = Counter(layer.skipped.values())
-        found = ", ".join(f"{count} x {kind}" for kind, count in kinds.items())
-        raise map_error(
-            path,
-            f"there is no polygon in the file ({found or 'it is empty'})",
-            fix="export the zones as polygons",
-            code="no-polygon",
-        )
+    here = _polygons(layer, path)
     try:
         native: Objects = np.array([layer.geometries[index] for index in here], dtype=object)
         areas = to_longitude_latitude(native, crs, path=path)
@@ -315,6 +308,21 @@ def ground_of(
             code="no-polygon",
         )
     return ground, repairs
+
+
+def _polygons(layer: Layer, path: Path) -> list[int]:
+    """Return which records are polygons; where none is, nothing else of the file matters."""
+    here = [index for index, area in enumerate(layer.geometries) if area is not None]
+    if not here:
+        kinds = Counter(layer.skipped.values())
+        found = ", ".join(f"{count} x {kind}" for kind, count in kinds.items())
+        raise map_error(
+            path,
+            f"there is no polygon in the file ({found or 'it has no records'})",
+            fix="export the zones as polygons",
+            code="no-polygon",
+        )
+    return here
 
 
 def _repaired(

@@ -16,7 +16,7 @@ from pyproj import CRS
 
 from companion.core.frame import LocalFrame
 from missions.maps.crs import WGS84
-from missions.maps.model import Affine, Floats, Problem, map_error
+from missions.maps.model import RATE_MAX_L_HA, Affine, Floats, Problem, map_error
 from missions.maps.text_lattice import GridLayout, cell_numbers, layout_for, merged
 from missions.maps.text_map import MAX_CELLS, grid_of_points, named_crs, tied_down
 from missions.maps.text_points import TextMap
@@ -212,13 +212,15 @@ _OFF_MORE = 0.001
 # Beyond any degrees: such coordinates are metres or feet.
 _DEGREES_MAX = 400.0
 
-Gridded = tuple[CRS | None, Affine, dict[str, Floats], tuple[Problem, ...]]
+# Column and row of every point.
+Places = tuple[Ints, Ints]
+Gridded = tuple[CRS | None, Affine, dict[str, Floats], Places, tuple[Problem, ...]]
 
 
 def cells_of_degrees(
     longitude_deg: Floats, latitude_deg: Floats, values: Mapping[str, Floats], path: Path
 ) -> Gridded:
-    """Return CRS, transform, (rows, columns) of every column of values, and what to say."""
+    """Return CRS, transform, cells of every column of values, the points' places, what to say."""
     points = np.column_stack([longitude_deg, latitude_deg])
     frame = LocalFrame(
         latitude_deg=float(latitude_deg.min() / 2 + latitude_deg.max() / 2),
@@ -230,8 +232,8 @@ def cells_of_degrees(
         return _irregular_degrees(latitude_deg, longitude_deg, values, path)
     degrees = refit(found, points)
     if degrees.off <= found.off + _OFF_MORE:
-        return WGS84, _straight(degrees), _placed(degrees, values, path), ()
-    return named_crs(frame), _straight(found), _placed(found, values, path), ()
+        return WGS84, _straight(degrees), *_placed(degrees, values, path), ()
+    return named_crs(frame), _straight(found), *_placed(found, values, path), ()
 
 
 def cells_of_coordinates(x: Floats, y: Floats, values: Mapping[str, Floats], path: Path) -> Gridded:
@@ -239,7 +241,7 @@ def cells_of_coordinates(x: Floats, y: Floats, values: Mapping[str, Floats], pat
     points = np.column_stack([x, y])
     found = find_lattice(points)
     if found is not None:
-        return None, _straight(found), _placed(found, values, path), ()
+        return None, _straight(found), *_placed(found, values, path), ()
     if not float(np.abs(points).max()) > _DEGREES_MAX:
         raise map_error(
             path,
@@ -253,10 +255,10 @@ def cells_of_coordinates(x: Floats, y: Floats, values: Mapping[str, Floats], pat
         north_m=(float(y.min()), float(y.max())),
     )
     _check_cells(layout.rows * layout.columns, len(values), path)
-    grids = _merged(layout, x, y, values)
+    grids, places = _merged(layout, x, y, values)
     size = float(layout.cell_m)
     transform = (size, 0.0, layout.east_min_m, 0.0, size, layout.north_min_m)
-    return None, transform, grids, (_irregular(layout, grids, path),)
+    return None, transform, grids, places, (_irregular(layout, grids, path),)
 
 
 def _irregular_degrees(
@@ -272,26 +274,27 @@ def _irregular_degrees(
     grid = grid_of_points(points, path, merge="mean")
     _check_cells(grid.rates_l_min.size, len(values), path)
     east, north, _ = grid.plane.to_local(latitude_deg, longitude_deg, nothing)
-    grids = _merged(grid.layout, east, north, values)
+    grids, places = _merged(grid.layout, east, north, values)
     frame, transform = tied_down(grid)
-    return named_crs(frame), transform, grids, (_irregular(grid.layout, grids, path),)
+    return named_crs(frame), transform, grids, places, (_irregular(grid.layout, grids, path),)
 
 
 def _merged(
     layout: GridLayout, x: Floats, y: Floats, values: Mapping[str, Floats]
-) -> dict[str, Floats]:
-    """Return the mean in every cell; points without a value do not count."""
+) -> tuple[dict[str, Floats], Places]:
+    """Return the mean in every cell; points without a value do not count.
+
+    A point that is no rate spoils its cell, which would else hide it among its neighbours.
+    """
     column, row = cell_numbers(layout, x, y)
-    there = {name: ~np.isnan(column_values) for name, column_values in values.items()}
-    return {
-        name: merged(
-            layout,
-            (column[there[name]], row[there[name]]),
-            column_values[there[name]],
-            merge="mean",
-        )
-        for name, column_values in values.items()
-    }
+    grids = {}
+    for name, numbers in values.items():
+        there = ~np.isnan(numbers)
+        cells = (column[there], row[there])
+        grids[name] = merged(layout, cells, numbers[there], merge="mean")
+        wrong = (numbers < 0.0) | (numbers >= RATE_MAX_L_HA)
+        grids[name][row[wrong] - 1, column[wrong] - 1] = numbers[wrong]
+    return grids, (column - 1, row - 1)
 
 
 def _irregular(layout: GridLayout, grids: Mapping[str, Floats], path: Path) -> Problem:
@@ -307,14 +310,16 @@ def _irregular(layout: GridLayout, grids: Mapping[str, Floats], path: Path) -> P
     )
 
 
-def _placed(found: PointLattice, values: Mapping[str, Floats], path: Path) -> dict[str, Floats]:
+def _placed(
+    found: PointLattice, values: Mapping[str, Floats], path: Path
+) -> tuple[dict[str, Floats], Places]:
     _check_cells(found.rows * found.columns, len(values), path)
     grids = {}
     for name, column_values in values.items():
         grid = np.full((found.rows, found.columns), np.nan)
         grid[found.row, found.column] = column_values
         grids[name] = grid
-    return grids
+    return grids, (found.column, found.row)
 
 
 def _check_cells(cells: int, columns: int, path: Path) -> None:

@@ -7,19 +7,24 @@ import re
 from collections.abc import Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from io import StringIO
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 from pyproj import CRS
 from shapely import MultiPolygon, Polygon
 from shapely.errors import ShapelyError
 
+from companion.errors import MapError
+from companion.wording import counted, iconv
 from missions.maps.crs import WGS84, parse_crs
-from missions.maps.csv_points import cells_of_coordinates, cells_of_degrees
-from missions.maps.fields import NONE, score, words
+from missions.maps.csv_points import Places, cells_of_coordinates, cells_of_degrees
+from missions.maps.fields import NONE, refuse_text, score
 from missions.maps.model import (
     COORDINATE_MAX,
     MAX_FILE_BYTES,
@@ -29,6 +34,7 @@ from missions.maps.model import (
     Floats,
     Grid,
     Layer,
+    Problem,
     Value,
     check_coordinates,
     check_counts,
@@ -47,7 +53,6 @@ _LONGITUDE = ("lon", "lng", "long", "longitude", "londeg", "longitudedeg", "lond
 _X = ("easting", "east", "eastm", "eastingm", "utme", "utmeast", "x", "xcoord", "pointx")
 _Y = ("northing", "north", "northm", "northingm", "utmn", "utmnorth", "y", "ycoord", "pointy")
 _WKT = ("wkt", "geometry", "geom", "thegeom", "wktgeom", "geomwkt")
-_UNIT = frozenset(("unit", "units", "uom"))
 # What WKT of ground begins with; others are left out unread. PostGIS puts the CRS before it.
 _AREA = re.compile(r"\s*(?:SRID=(\d{1,6});)?\s*((?:MULTI)?POLYGON)\b", re.IGNORECASE | re.ASCII)
 _KIND = re.compile(r"\s*(?:SRID=\d{1,6};)?\s*([A-Za-z]{1,20})", re.ASCII)
@@ -114,33 +119,95 @@ def _grid(table: Table, place: tuple[str, ...], sha256: str) -> Grid:
         numbers = None if name in place else table.numbers(name)
         if numbers is not None:
             values[name] = numbers
-    if _letters(place[0]) in _LONGITUDE:
+    in_degrees = _letters(place[0]) in _LONGITUDE
+    if in_degrees:
         _check_degrees(table, x, y)
-        crs, transform, grids, problems = cells_of_degrees(x, y, values, table.path)
-    else:
-        crs, transform, grids, problems = cells_of_coordinates(x, y, values, table.path)
-    units = _units(table, tuple(values))
-    if not grids:
+    if not values:
         for name in table.columns:
             if name not in place:
                 table.refuse_bad_cell(name)
+                refuse_text(name, table.columns[name], table.path)
         raise map_error(
             table.path,
             f"no column but those of the place holds numbers{table.example_of(place)}",
             fix="add the rates in a column of their own",
             code="no-rate-column",
         )
+    places = _Places(table, x + 1j * y)
+    once = {name: numbers[places.first] for name, numbers in values.items()}
+    cells = cells_of_degrees if in_degrees else cells_of_coordinates
+    crs, transform, grids, at, problems = cells(x[places.first], y[places.first], once, table.path)
+    rated = ~np.all([np.isnan(numbers) for numbers in values.values()], axis=0)
     return Grid(
         format="csv",
         crs=crs,
         transform=transform,
         bands=tuple(
-            Band(name=name, values=grid, unit=units.get(name)) for name, grid in grids.items()
+            Band(
+                name=name,
+                values=grid,
+                fault=places.fault(name, values[name]),
+                line_of=partial(places.line_of, at, once[name]),
+            )
+            for name, grid in grids.items()
+        ),
+        columns=tuple(
+            Column(name=name, values=tuple(compress(texts, rated)), numeric=False)
+            for name, texts in table.columns.items()
+            if name not in place and name not in values
         ),
         sha256=sha256,
-        unit=units.get(""),
-        problems=problems,
+        problems=(*places.problems, *problems),
     )
+
+
+class _Places:
+    """The places of points: which rows stand first at theirs, and which lines rates are of."""
+
+    def __init__(self, table: Table, points: NDArray[np.complex128]) -> None:
+        _, first, which = np.unique(points, return_index=True, return_inverse=True)
+        self._table, self._of = table, first[which]
+        self.first = np.sort(first)
+
+    def fault(self, name: str, numbers: Floats) -> MapError | None:
+        """Return why a column can be no rate: it says two things of one place."""
+        others = numbers[self._of]
+        differ = np.flatnonzero((numbers != others) & ~(np.isnan(numbers) & np.isnan(others)))
+        if not len(differ):
+            return None
+        rows = int(self._of[differ[0]]), int(differ[0])
+        (one, own), (two, other) = ((self._table.lines[row], numbers[row]) for row in rows)
+        return map_error(
+            self._table.path,
+            f"lines {one} and {two} are of one place, and {name} is {own:g} in one and {other:g} "
+            "in the other",
+            fix="keep the line that is right",
+            code="two-rates",
+        )
+
+    @property
+    def problems(self) -> tuple[Problem, ...]:
+        """Return what there is to say of places that stand more than once."""
+        again = np.flatnonzero(self._of != np.arange(len(self._of)))
+        if not len(again):
+            return ()
+        one, two = (self._table.lines[row] for row in (self._of[again[0]], again[0]))
+        problem = Problem(
+            severity="warning",
+            code="duplicate-points",
+            text=f"{counted(len(again), 'row')} of places that stand before are left out; line "
+            f"{two} is of the place of line {one}",
+            where=str(self._table.path),
+            fix="compare the number of points with that of the program that made the map",
+        )
+        return (problem,)
+
+    def line_of(self, at: Places, numbers: Floats, row: int, column: int) -> int:
+        """Return the line of a cell's point, of several that with the least or largest value."""
+        here = np.flatnonzero((at[0] == column) & (at[1] == row))
+        values = np.nan_to_num(numbers[here])
+        worst = int(np.argmin(values) if values.min() < 0.0 else np.argmax(values))
+        return self._table.lines[int(self.first[here[worst]])]
 
 
 def _coordinates(table: Table, name: str) -> Floats:
@@ -175,29 +242,6 @@ def _check_degrees(table: Table, longitude_deg: Floats, latitude_deg: Floats) ->
         else "write degrees, or name the columns easting and northing and give --crs",
         code="swapped-axes" if exchanged else "out-of-range",
     )
-
-
-def _units(table: Table, bands: Sequence[str]) -> dict[str, str]:
-    """Return the unit that a column of text gives for a band, and for all under an empty name."""
-    found: dict[str, str] = {}
-    for name, values in table.columns.items():
-        parts = words(name)
-        if not _UNIT & set(parts):
-            continue
-        texts = sorted({value.strip() for value in values} - {""})
-        others = [part for part in parts if part not in _UNIT]
-        meant = [band for band in bands if words(band) == others] if others else [""]
-        if not meant or not texts:
-            continue
-        if len(texts) > 1:
-            raise map_error(
-                table.path,
-                f"{name} states several units: {', '.join(texts[:3])}",
-                fix="convert the rates to one",
-                code="unit-conflict",
-            )
-        found[meant[0]] = texts[0]
-    return found
 
 
 def _layer(table: Table, name: str, sha256: str) -> Layer:
@@ -301,7 +345,7 @@ class Table:
         it would be left aside as a whole.
         """
         found = self._numbers(name)
-        if found is None and score(Column(name=name, values=(), numeric=True)) != NONE:
+        if found is None and score(Column(name=name, values=(), numeric=True)) > NONE:
             self.refuse_bad_cell(name)
         if found is not None and np.isinf(found).any():
             index = int(np.argmax(np.isinf(found)))
@@ -422,7 +466,7 @@ def _text(content: bytes, path: Path) -> str:
         # Which letter such a byte is depends on the program that wrote it: it is not guessed.
         raise map_error(
             path, f"this is not text in UTF-8{where}", code="encoding",
-            fix=f"{_AS_CSV}, or: iconv -f WINDOWS-1252 -t UTF-8 FILE > NEW.csv",
+            fix=f"{_AS_CSV}, or: {iconv(content, path)}",
         )  # fmt: skip
     return text
 

@@ -17,6 +17,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from companion.wording import counted
 from missions.maps.bundle import Bundle, files_beside, open_bundle
 from missions.maps.model import Column, Problem, Value, check_counts, digest, map_error
 
@@ -45,13 +46,14 @@ class _Field:
 
 def read_columns(
     dbf: bytes | None, cpg: bytes | None, *, path: Path, count: int
-) -> tuple[tuple[Column, ...], tuple[Problem, ...]]:
-    """Return the columns of all records, of which there have to be as many as shapes.
+) -> tuple[tuple[Column, ...], list[int], tuple[Problem, ...]]:
+    """Return the columns of all records that stand, which they are, and what to tell.
 
-    Deleted records keep their place and are all blank. The problems are about the encoding.
+    There have to be as many records as shapes. A program that deletes one marks it and leaves its
+    shape lying: it is no ground any more, to GDAL neither.
     """
     if dbf is None:
-        return (), ()
+        return (), list(range(count)), ()
     table = path.with_suffix(".dbf")
     records, header_bytes, record_bytes = _header(dbf, table)
     if records != count:
@@ -71,27 +73,34 @@ def read_columns(
     rows = body.reshape(records, record_bytes)
     if not np.isin(rows[:, 0], _FLAGS).all():
         raise _broken(table, "its records do not stand where its header says")
+    stands = np.flatnonzero(rows[:, 0] != _DELETED).tolist()
+    rows = rows[stands]
     cells = [_cells(rows, field) for field in fields]
     texts = Texts(dbf[29], cpg)
     columns = tuple(_column(field, raw, texts) for field, raw in zip(fields, cells, strict=True))
-    strays = _strays(dbf, header_bytes + records * record_bytes, record_bytes, table)
-    return columns, (*strays, *texts.problems(table))
+    behind = _behind(dbf[header_bytes + records * record_bytes :], record_bytes)
+    rows_of = "behind the last one that the header of the attribute table counts"
+    deleted = records - len(stands)
+    strays = _stray(behind, f"{counted(behind, 'row')} {rows_of}", table)
+    strays += _stray(deleted, counted(deleted, "deleted record"), table)
+    return columns, stands, (*strays, *texts.problems(table))
 
 
-def _strays(dbf: bytes, end: int, record_bytes: int, table: Path) -> tuple[Problem, ...]:
-    """Return a warning for whole rows behind the last that the header counts."""
-    rest = dbf[end:]
+def _behind(rest: bytes, record_bytes: int) -> int:
+    """Return how many whole rows follow the last that the header counts."""
     count = len(rest) // record_bytes
     flags = rest[: count * record_bytes : record_bytes]
     # What follows the last row is a mark, and zeros of the file system; a row begins with a flag.
-    rows = next((number for number, flag in enumerate(flags) if flag not in _FLAGS[:2]), count)
-    if not rows:
+    return next((number for number, flag in enumerate(flags) if flag not in _FLAGS[:2]), count)
+
+
+def _stray(count: int, what: str, table: Path) -> tuple[Problem, ...]:
+    if not count:
         return ()
     problem = Problem(
         severity="warning",
         code="stray-records",
-        text=f"{rows} {'row' if rows == 1 else 'rows'} behind the last one that the header of the "
-        "attribute table counts are left out",
+        text=f"{what} {'is' if count == 1 else 'are'} left out",
         where=str(table),
         fix="compare the number of zones with that of the program that made the map, or export it "
         "again",
@@ -128,13 +137,11 @@ def _fields(header: bytes, table: Path) -> list[_Field]:
 
 
 def _cells(rows: np.ndarray[tuple[int, int], np.dtype[np.uint8]], field: _Field) -> list[bytes]:
-    """Return one column's bytes, empty for deleted records."""
+    """Return one column's bytes."""
     if not field.width or not len(rows):
         return [b""] * len(rows)
     block = np.ascontiguousarray(rows[:, field.at : field.at + field.width])
     raw: list[bytes] = block.view(f"S{field.width}").ravel().tolist()
-    for index in np.flatnonzero(rows[:, 0] == _DELETED).tolist():
-        raw[index] = b""
     return raw
 
 

@@ -9,17 +9,31 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.errors import ConfigError
-from missions.maps.model import Band, Column, Grid, Layer, Problem, Value, as_number, map_error
+from companion.errors import ConfigError, MapError
+from companion.wording import typed
+from missions.maps.model import (
+    Band,
+    Column,
+    Floats,
+    Grid,
+    Layer,
+    Problem,
+    Value,
+    as_number,
+    map_error,
+)
 from missions.maps.units import (
     RateUnit,
+    bare,
     is_mass_per_area,
+    is_volume,
     l_ha_per_unit,
     other_quantity,
     quantity_in_name,
@@ -29,35 +43,54 @@ from missions.maps.units import (
     unit_name,
 )
 
-# What rate columns are called; DBF cuts names at ten characters (`TargetRate`, `Tgt_Rate_l`).
-# Seen in maps: rate, rateInt, dose, DOSE, value, Tgt_Rate; the others are the words of farm
-# software in English, French, Spanish, Italian, Portuguese, German and Chinese.
-_WORDS = frozenset(
-    {
-        "rate", "rates", "apprate", "targetrate", "targetrat", "tgtrate", "rxrate", "ratelha",
-        "dose", "doses", "dosis", "dosage", "dosaggio", "dosi", "appdose", "rx",
-        "prescription", "prescrip", "setpoint", "aufwandmenge", "aufwand", "sollwert",
-        "sollmenge", "lha", "施药量", "用量", "亩用量", "剂量", "喷量",
-    }
-)  # fmt: skip
-_WEAK_WORDS = frozenset(
-    {
-        "value", "values", "val", "amount", "quantity", "menge", "target", "application",
-        "volume", "wert", "valor", "valeur", "quantite", "cantidad", "quantita", "quantidade",
-    }
-)  # fmt: skip
-# Numbers that stand beside a rate and are none.
-_DECOYS = frozenset(
-    {
-        "area", "areas", "ha", "acres", "id", "fid", "oid", "gid", "objectid", "zone", "zones",
-        "zoneid", "level", "class", "classid", "cluster", "rank", "perimeter", "length", "len",
-        "width", "lon", "lat", "longitude", "latitude", "x", "y", "z", "elevation", "altitude",
-        "height", "count", "total", "sum", "percent", "pct", "ndvi", "ndre", "yield", "speed",
-        "time", "date", "year", "price", "cost", "color", "colour", "unit", "min", "max",
-        "mean", "avg", "std", "stdev", "shape",
-    }
-)  # fmt: skip
-STRONG, NAMED, WEAK, NONE = 3, 2, 1, 0
+
+def _words(text: str) -> frozenset[str]:
+    return frozenset(bare(text).split())
+
+
+# What rate columns are called, by the farm software of those who write the formats. DBF cuts names
+# at ten characters (`TargetRate`).
+_RATES = _words(
+    "rate rates targetrat dose doses dosis dosi dosage dosaggio dosagem dosificacion dosierung "
+    "dosering doz doza dozy dozsa dozis dos giva gift annos davka davky dawka dawki deva adag "
+    "tasa taxa rx prescription prescrip setpoint aufwand aufwandmenge ausbringmenge sollwert "
+    "sollmenge lha доза дозы норма δοση 施药量 用量 亩用量 剂量 喷量 散布量 施用量 살포량 처방량"
+)
+# Quantities of something, over an area or in all.
+_AMOUNTS = _words(
+    "amount quantity volume menge quantite cantidad quantita quantidade hoeveelheid mængde mängd "
+    "mengde määrä ilosc mnozstvi kolicina cantitate mennyiseg miktar ποσοτητα количество "
+    "кількість объем volumen vol qty 数量 量 수량"
+)
+_WEAK = _AMOUNTS | _words(
+    "value values val target application wert valor valeur valore waarde arvo wartosc hodnota "
+    "norm norma taux tasso oran deger значение 值"
+)
+_TOTALS = _words(
+    "total totals totale totali totaux totaal totalt tot ttl ges gesamt insgesamt summe summa sum "
+    "suma somme somma soma ialt toplam razem lacznie celkem celkom celkova ukupno osszes yhteensa "
+    "σύνολο сумма итого всего общий общая всього 总 总量 合计 合計 총"
+)
+_AREAS = _words("ha ac acre acres hectare hectares hektar")
+_MEANS = _words(
+    "mean avg average moy moyenne media promedio mittel mittelwert durchschnitt gem medel median"
+)
+# What numbers that stand beside a rate are of.
+_OTHERS = _words(
+    "area areas flache flaeche surface superficie id fid oid gid objectid zone zones zoneid level "
+    "class classid cluster rank perimeter length len width lon lat longitude latitude x y z "
+    "elevation altitude height count percent pct ndvi ndre yield speed time date year price cost "
+    "color colour unit min max std stdev shape"
+)
+_OF_NAMES = _words("app tgt spray")
+_PLAIN = _RATES | _WEAK | _AREAS | _OF_NAMES
+_KNOWN = _PLAIN | _TOTALS | _MEANS | _OTHERS
+# How clearly a column is the rate. Who has a word for it, but is not clearly it, is never taken
+# unasked, and nothing weaker beside it.
+STRONG, NAMED, WEAK, NONE, UNCLEAR, TOTAL = 3, 2, 1, 0, -1, -2
+# Values that grow with the area of their records: divided by it they spread so much less. Of few
+# records, and of a column that is called a rate, more is asked for than chance gives.
+_SPREAD_MIN, _SHARE_MAX, _SHARE_FEW, _FEW = 0.2, 0.45, 0.1, 4
 
 
 Source = TypeVar("Source", Column, Band)
@@ -71,83 +104,167 @@ class Choice(Generic[Source]):
     problems: tuple[Problem, ...] = ()
 
 
-def words(name: str) -> list[str]:
-    """Return the words of a column's name, in lower case.
+@lru_cache(maxsize=4096)
+def words(name: str) -> tuple[str, ...]:
+    """Return the words of a column's name, in lower case, without accents, compounds taken apart.
 
-    >>> words("Tgt_Rate"), words("rateInt"), words("DOSE_UNIT"), words("area_total")
-    (['tgt', 'rate'], ['rate', 'int'], ['dose', 'unit'], ['area', 'total'])
+    >>> words("Tgt_Rate"), words("rateInt"), words("DOSETOT"), words("Gesamtmenge")
+    (('tgt', 'rate'), ('rate', 'int'), ('dose', 'tot'), ('gesamt', 'menge'))
     """
-    split = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
-    return [word for word in re.split(r"[\W_\d]+", split.casefold()) if word]
+    split = bare(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name))
+    return tuple(part for word in re.split(r"[\W_\d]+", split) if word for part in _apart(word))
+
+
+def _apart(word: str) -> tuple[str, ...]:
+    """Return the known words that one is made of, or the word itself."""
+    if word not in _KNOWN and len(word) <= 40:
+        for end in range(len(word) - 1, 1 if word.isascii() else 0, -1):
+            rest = _apart(word[end:])
+            known = _KNOWN.issuperset((word[:end], *rest))
+            if known and len(word) - end > word.isascii():
+                return word[:end], *rest
+    return (word,)
 
 
 def score(column: Column | Band) -> int:
     """Return how clearly a column's name says that it holds the rate.
 
-    >>> [score(Column(name=name, values=(), numeric=True)) for name in ("rate", "rateInt", "value")]
-    [3, 2, 1]
-    >>> [score(Column(name=name, values=(), numeric=True)) for name in ("area", "zone", "rate_id")]
-    [0, 0, 0]
+    >>> def score_of(name): return score(Column(name=name, values=(), numeric=True))
+    >>> [score_of(name) for name in ("rate", "DOSE_HA", "MeanRate", "value")]
+    [3, 3, 2, 1]
+    >>> [score_of(name) for name in ("area", "zone", "rate_id", "DOSE_TOT", "Menge_l")]
+    [0, 0, -1, -2, -2]
     """
-    parts = words(column.name)
     if isinstance(column, Column) and not column.numeric:
         return NONE
-    if "".join(parts) in _WORDS or unit_in_name(column.name) is not None:
-        return STRONG
-    if any(part in _DECOYS for part in parts):
+    parts = set(words(column.name))
+    unit = unit_in_name(column.name)
+    rate = unit is not None or not parts.isdisjoint(_RATES)
+    other = not parts.isdisjoint(_OTHERS)
+    if unit is None and not other and _is_total(column.name):
+        return TOTAL
+    if rate:
+        return UNCLEAR if other else NAMED + (unit is not None or parts <= _PLAIN)
+    if other or parts & _MEANS or not parts & (_WEAK if not parts & _AREAS else _AMOUNTS):
         return NONE
-    if any(part in _WORDS for part in parts):
-        return NAMED
-    return WEAK if any(part in _WEAK_WORDS for part in parts) else NONE
+    return NAMED if parts & _AREAS else WEAK
 
 
-def choose(columns: Sequence[Source], *, asked: str | None, path: Path) -> Choice[Source]:
+def _is_total(name: str) -> bool:
+    """Tell whether a name says that its numbers are of a whole area, by a word or by the unit."""
+    parts = words(name)
+    in_all = _AMOUNTS.intersection(parts) and is_volume(parts[-1])
+    return bool(in_all) or not _TOTALS.isdisjoint(parts)
+
+
+def choose(
+    columns: Sequence[Source], *, asked: str | None, path: Path, areas: Floats | None = None
+) -> Choice[Source]:
     """Return the rate column: the one asked for, or the only one that it can be.
 
     A format that marks its rates has one for each product; one product is flown at a time.
+    `areas` are those of the records, on any scale: values that grow with them are a total.
     """
-    if asked is not None:
-        return Choice(column=_asked(columns, asked, path))
     marked = [column for column in columns if column.is_rate]
-    if len(marked) > 1:
+    choice: Choice[Source]
+    if asked is not None:
+        choice = Choice(column=_asked(columns, asked, path))
+    elif len(marked) > 1:
         raise map_error(
             path,
-            f"the map holds {len(marked)} products: {', '.join(one.name for one in marked)}",
+            f"the map holds {len(marked)} products: {typed(one.name for one in marked)}",
             fix="name the one to spray with --rate-field (prescription.rate_field)",
             code="several-products",
         )
-    if marked:
-        return Choice(column=marked[0])
+    else:
+        choice = Choice(column=marked[0]) if marked else _among(_candidates(columns, path), path)
+    rate = choice.column
+    if areas is not None and isinstance(rate, Column) and grows(rate, areas):
+        name = rate.name
+        text = f"the values of {name} grow with the area of its zones, so {name} is a total"
+        fix = "name the column with the rate per area with --rate-field (prescription.rate_field)"
+        if asked is None and not marked:
+            fix += f", or {typed([name])} if it is one"
+            raise map_error(path, text, fix=fix, code="total-column")
+        problem = Problem(severity="warning", code="total-column", text=text, where=name, fix=fix)
+        choice = replace(choice, problems=(*choice.problems, problem))
+    return choice
+
+
+def _candidates(columns: Sequence[Source], path: Path) -> list[Source]:
+    """Return the columns that the rate can be, all equally: what only may be it is asked about."""
     columns = [_with_numbers(column) for column in columns]
-    usable = [column for column in columns if score(column) and _holds_numbers(column)]
-    blank = [column for column in columns if score(column) >= NAMED and column not in usable]
-    if not usable and len(blank) == 1:
+    full = [column for column in columns if _holds_numbers(column)]
+    named = [column for column in full if score(column) >= NAMED]
+    if named:
+        return sorted(named, key=score, reverse=True)
+    weak: list[Source] = [column for column in full if score(column) == WEAK]
+    for column in columns:
+        if isinstance(column, Column):
+            refuse_text(column.name, column.values, path)
+    blank = [column for column in columns if score(column) >= NAMED]
+    if blank:
         raise map_error(
             path,
-            f"{blank[0].name} is blank in every record",
-            fix="give the zones a rate, 0 for none, or name another column with --rate-field "
-            "(prescription.rate_field)",
+            f"{typed(one.name for one in blank)} is blank in every record",
+            fix=f"give the zones a rate, 0 for none, or {_NAME_IT}",
             code="null-rate",
         )
-    strong = [column for column in usable if score(column) >= NAMED]
-    candidates = sorted(strong or usable, key=score, reverse=True)
-    if not candidates and len(columns) == 1 and isinstance(columns[0], Band):
-        candidates = list(columns)  # a raster of one band is a map of that
-    if not candidates:
-        several_bands = len(columns) > 1 and isinstance(columns[0], Band)
+    unclear: list[Source] = [
+        one for one in full if score(one) < NONE and not _RATES.isdisjoint(words(one.name))
+    ]
+    if weak and unclear:
+        raise _differ([*unclear, *weak], path)
+    if weak:
+        return weak
+    bands: list[Source] = [column for column in columns if isinstance(column, Band)]
+    if len(columns) == 1 and bands and not {*words(bands[0].name)} & (_OTHERS | _TOTALS):
+        return list(columns)  # a raster of one band is a map of that
+    numeric = [one.name for one in columns if isinstance(one, Band) or one.numeric]
+    totals = typed(one.name for one in full if score(one) == TOTAL)
+    several = len(bands) > 1
+    raise map_error(
+        path,
+        f"no band looks like a rate; there are {typed(numeric) or 'none'}"
+        if several
+        else f"no column looks like a rate; its numeric columns are {typed(numeric) or 'none'}"
+        + (f", and {totals} is a total by its name" if totals else ""),
+        fix=_NAME_IT,
+        code="several-products" if several else "no-rate-column",
+    )
+
+
+_NAME_IT = "name the column with --rate-field (prescription.rate_field)"
+
+
+def refuse_text(name: str, values: Iterable[Value], path: Path, where: str = "") -> None:
+    """Refuse a column that is called a rate and holds text like `18,5` or `18.5 L/ha`."""
+    if score(Column(name=name, values=(), numeric=True)) < NAMED:
+        return
+    texts = (value.strip() for value in values if isinstance(value, str) and value.strip())
+    text = next((one for one in texts if _NUMBER.fullmatch(one) is None), "")
+    if re.match(r"[+-]?[\d.,]*\d", text, re.ASCII):
         raise map_error(
             path,
-            f"no band looks like a rate; there are {_names(columns)}"
-            if several_bands
-            else f"no column looks like a rate; its numeric columns are {_names(columns)}",
-            fix="name it with --rate-field (prescription.rate_field)"
-            if several_bands
-            else "name the column with --rate-field (prescription.rate_field)",
-            code="several-products" if several_bands else "no-rate-column",
+            f"{where}{name} holds {text[:40]!r}, which is text and not a number",
+            fix="write its rates as numbers like 18.5, with a point and without a unit",
+            code="text-rate",
         )
-    if len(candidates) == 1:
-        return Choice(column=candidates[0])
-    return _among(candidates, path)
+
+
+def grows(column: Column, areas: Floats) -> bool:
+    """Tell whether a column's values follow the area of their records, as totals do."""
+    try:
+        values = _numbers(column)
+    except ValueError:
+        return False
+    some = (values > 0.0) & (areas > 0.0)
+    if np.count_nonzero(some) < 2:
+        return False
+    value, area = np.log(values[some]), np.log(areas[some])
+    few = len(value) < _FEW and score(column) != WEAK
+    most = (_SHARE_FEW if few else _SHARE_MAX) * float(value.std())
+    return float(area.std()) > _SPREAD_MIN and float((value - area).std()) < most
 
 
 def _with_numbers(column: Source) -> Source:
@@ -171,7 +288,7 @@ def _asked(columns: Sequence[Source], asked: str, path: Path) -> Source:
             f"there is no column {asked!r}"
             if not found
             else f"the column {asked!r} is there {len(found)} times",
-            fix=f"take one of {', '.join(column.name for column in columns) or 'none'}"
+            fix=f"take one of {typed(column.name for column in columns) or 'none'}"
             " for --rate-field (prescription.rate_field)",
             code="no-rate-column",
         )
@@ -184,22 +301,13 @@ def _holds_numbers(column: Column | Band) -> bool:
     return any(value is not None for value in column.values)
 
 
-def _names(columns: Sequence[Column] | Sequence[Band]) -> str:
-    numeric = [one for one in columns if isinstance(one, Band) or one.numeric]
-    return ", ".join(column.name for column in numeric) or "none"
-
-
 def _among(candidates: Sequence[Source], path: Path) -> Choice[Source]:
     """Return the one whose values the other candidates repeat, if there is such a one."""
+    if len(candidates) == 1:
+        return Choice(column=candidates[0])
     best = next((one for one in candidates if _repeated_by(one, candidates)), None)
     if best is None:
-        names = ", ".join(column.name for column in candidates)
-        raise map_error(
-            path,
-            f"several columns can be the rate and differ: {names}",
-            fix="name one with --rate-field (prescription.rate_field)",
-            code="several-columns",
-        )
+        raise _differ(candidates, path)
     others = ", ".join(column.name for column in candidates if column is not best)
     problem = Problem(
         severity="warning",
@@ -207,9 +315,19 @@ def _among(candidates: Sequence[Source], path: Path) -> Choice[Source]:
         text=f"the rate is taken from {best.name}; {others} could be it too, but says the same "
         "(equal, or rounded to whole numbers) in every record",
         where=best.name,
-        fix="name the column with --rate-field (prescription.rate_field)",
+        fix=_NAME_IT,
     )
     return Choice(column=best, problems=(problem,))
+
+
+def _differ(candidates: Sequence[Column | Band], path: Path) -> MapError:
+    names = typed(column.name for column in candidates)
+    return map_error(
+        path,
+        f"several columns can be the rate and differ: {names}",
+        fix="name one with --rate-field (prescription.rate_field)",
+        code="several-columns",
+    )
 
 
 def _repeated_by(best: Source, candidates: Sequence[Source]) -> bool:
@@ -295,18 +413,10 @@ def _unit(text: str) -> str | None:
 
 # ----------------------------------------------------------------------------------------- the unit
 
-_UNIT_WORDS = frozenset(
-    {
-        "unit", "units", "uom", "einheit", "unite", "unites", "unidad", "unita", "单位",
-    }
-)  # fmt: skip
-# `area_unit` is of the area; these words before `unit` mean the rate.
-_RATE_WORDS = frozenset(
-    {
-        "rate", "dose", "dosis", "app", "application", "target", "tgt", "rx", "value",
-        "amount",
-    }
-)  # fmt: skip
+_UNIT_WORDS = _words(
+    "unit units uom einheit einh unite unites unidad unidade unita eenheid enhed enhet jednostka "
+    "jednotka birim единица ед 单位"
+)
 _BLANK = frozenset(("", "-", "n/a", "na", "none", "null", "unknown"))
 _FIX = "give the unit with --unit (prescription.unit): L/ha, gal/ac, mL/m2 or L/mu"
 
@@ -352,17 +462,12 @@ def unit_of(layer: Layer | Grid, rate: Column | Band, *, given: Given, path: Pat
     and differ, one of them is wrong, and which is not for a program to decide.
     """
     wanted = None if given.unit is None else _wanted(given.unit, path)
-    declared = _declared(layer, rate)
+    declared = _declared(layer, rate, given, path)
     known = {found.name: found for found in map(rate_unit, declared) if found is not None}
     _refuse_other_quantity(layer, rate, declared, wanted=wanted, known=bool(known), path=path)
     unknown = [text for text in declared if rate_unit(text) is None]
     if unknown and (wanted is None or any(map(is_mass_per_area, unknown))):
-        raise map_error(
-            path,
-            f"its unit {unknown[0][:40]!r} is not a volume per area",
-            fix=_FIX,
-            code="not-a-volume",
-        )
+        raise _no_unit(f"its unit {unknown[0][:40]!r}", unknown[0], path)
     if len(known) > 1:
         names = ", ".join(sorted(known))
         raise map_error(
@@ -487,13 +592,19 @@ def _in_litres(
 def _wanted(asked: str, path: Path) -> RateUnit:
     found = rate_unit(asked)
     if found is None:
-        raise map_error(
-            path,
-            f"the unit {asked!r} is not a volume per area",
-            fix=_FIX,
-            code="not-a-volume",
-        )
+        raise _no_unit(f"the unit {asked[:40]!r}", asked, path)
     return found
+
+
+def _no_unit(what: str, unit: str, path: Path) -> MapError:
+    """Return the refusal of a unit: of something else, or of nothing that is known here."""
+    other = is_volume(unit) or is_mass_per_area(unit) or other_quantity(unit) is not None
+    return map_error(
+        path,
+        f"{what} is not a volume per area" if other else f"{what} is none that is known here",
+        fix=_FIX,
+        code="not-a-volume",
+    )
 
 
 def _overridden(unknown: Sequence[str], wanted: str, rate: Column | Band) -> list[Problem]:
@@ -510,25 +621,41 @@ def _overridden(unknown: Sequence[str], wanted: str, rate: Column | Band) -> lis
     ]
 
 
-def _declared(layer: Layer | Grid, rate: Column | Band) -> list[str]:
-    """Return every unit that the file states for its rates; that of the column itself first."""
-    if rate.unit is not None and rate.unit.strip().casefold() not in _BLANK:
-        return [rate.unit.strip()]
-    every = layer.columns if isinstance(layer, Layer) else ()
-    columns = [column for column in every if _is_unit_column(column, rate)]
+def _declared(layer: Layer | Grid, rate: Column | Band, given: Given, path: Path) -> list[str]:
+    """Return every unit that the file states for its rates; that of the column itself first.
+
+    A record whose unit is blank has none: that of its neighbours is theirs.
+    """
+    if not _is_blank(rate.unit):
+        return [str(rate.unit).strip()]
+    every = layer.bands if isinstance(layer, Grid) else layer.columns
+    others = [set(words(one.name)) for one in every if one.name != rate.name]
+    columns = [one for one in layer.columns if _is_unit_column(one, rate, others)]
     own = [column for column in columns if set(words(column.name)) & set(words(rate.name))]
-    stated = [value for column in own or columns for value in column.values]
-    texts = dict.fromkeys(
-        str(text).strip()
-        for text in (layer.unit, unit_in_name(rate.name), *stated)
-        if text is not None
-    )
-    return [text for text in texts if text.casefold() not in _BLANK]
+    stated = [column.values for column in own or columns]
+    whole = [text for text in (layer.unit, unit_in_name(rate.name)) if not _is_blank(text)]
+    said = [str(value).strip() for one in stated for value in one if not _is_blank(value)]
+    if said and not whole and given.unit is None:
+        has_rate = rate.values if isinstance(rate, Column) else None
+        for index, units in enumerate(zip(*stated, strict=True)):
+            rated = has_rate is None or has_rate[index] is not None
+            if rated and all(map(_is_blank, units)):
+                raise map_error(
+                    path,
+                    f"record {index + 1} has no unit, others {said[0][:40]}",
+                    fix="give it one, or say with --unit (prescription.unit) that all have it",
+                    code="no-unit",
+                )
+    return list(dict.fromkeys(map(str, (*whole, *said))))
 
 
-def _is_unit_column(column: Column, rate: Column | Band) -> bool:
-    """Tell whether a column holds the unit of the rate, and not of something else."""
-    parts = words(column.name)
-    others = set(parts) - _UNIT_WORDS
-    meant = _RATE_WORDS | set(words(rate.name))
-    return len(others) < len(parts) and not column.numeric and others <= meant
+def _is_blank(text: Value) -> bool:
+    return text is None or str(text).strip().casefold() in _BLANK
+
+
+def _is_unit_column(column: Column, rate: Column | Band, others: Sequence[set[str]]) -> bool:
+    """Tell whether a column holds the unit of the rate, and not of something else or another."""
+    parts = set(words(column.name))
+    of = parts - _UNIT_WORDS
+    meant = _PLAIN | set(words(rate.name))
+    return of < parts and not column.numeric and of <= meant and of not in others

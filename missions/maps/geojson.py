@@ -17,6 +17,7 @@ from shapely.errors import ShapelyError
 from shapely.geometry.base import BaseGeometry
 
 from companion.map_formats import geojson_feature, geojson_geometry, geojson_text
+from companion.wording import iconv
 from missions.maps.bundle import Bundle, one_of, open_bundle
 from missions.maps.crs import WGS84, crs_name, parse_crs
 from missions.maps.local import BOUNDARY_NAME, Area, as_area, outline_of
@@ -99,11 +100,12 @@ def _parse(content: bytes, path: Path) -> dict[str, object]:
     try:
         document = json.loads(content.decode("utf-8-sig"), object_pairs_hook=_members)
     except UnicodeDecodeError as error:
-        if b"\0" in content:
+        if b"\0" in content and content[:2] not in (b"\xff\xfe", b"\xfe\xff"):
             text = "this is not text, so it cannot be GeoJSON"
             raise map_error(path, text, fix=_EXPORT_AGAIN, code="encoding") from None
         text = f"its text is not in UTF-8, as GeoJSON has to be ({error.reason})"
-        raise map_error(path, text, fix="save it as UTF-8", code="encoding") from None
+        fix = f"save it as UTF-8, or: {iconv(content, path)}"
+        raise map_error(path, text, fix=fix, code="encoding") from None
     except _DuplicateError as error:
         raise map_error(path, str(error), fix=_EXPORT_AGAIN, code="duplicate-member") from None
     except json.JSONDecodeError as error:

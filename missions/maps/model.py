@@ -13,7 +13,7 @@ import hashlib
 import math
 import re
 import stat
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -208,7 +208,8 @@ class Layer:
 class Band:
     """One value for every cell: (rows, columns), NaN for no data; the rest as for a `Column`.
 
-    `fault` is why it can be no rate, where that is so.
+    `fault` is why it can be no rate, where that is so; `line_of` tells which line of a text file a
+    cell (row, column) is of.
     """
 
     name: str
@@ -217,11 +218,15 @@ class Band:
     is_rate: bool = False
     default: float | None = None
     fault: MapError | None = None
+    line_of: Callable[[int, int], int] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Grid:
-    """The content of one file of cells; `transform` as in `MapCells`, all bands of one shape."""
+    """The content of one file of cells; `transform` as in `MapCells`, all bands of one shape.
+
+    `columns` are texts of the points that it was made of, which may state units.
+    """
 
     format: str
     crs: CRS | None
@@ -230,6 +235,7 @@ class Grid:
     sha256: str
     unit: str | None = None
     boundary: MultiPolygon | None = None
+    columns: tuple[Column, ...] = ()
     instead: str = ""
     problems: tuple[Problem, ...] = ()
 

@@ -66,19 +66,19 @@ def read_shapefile(path: Path, layer: str | None = None) -> Layer:
     """Return what a shapefile holds; `layer` names one of several in a folder or a zip."""
     files = find_shapefile(path, layer)
     offsets, problems = _index(files)
-    shapes = list(_shapes(files, offsets))
+    columns, stands, encoding = read_columns(
+        files.content.get(".dbf"),
+        files.content.get(".cpg"),
+        path=files.main,
+        count=len(offsets),
+    )
+    shapes = list(_shapes(files, [offsets[index] for index in stands]))
     geometries = _grounds([rings for rings, _, _ in shapes], files.main)
     skipped = {
         index: reason or "no-area"
         for index, ((_, reason, _), area) in enumerate(zip(shapes, geometries, strict=True))
         if area is None
     }
-    columns, encoding = read_columns(
-        files.content.get(".dbf"),
-        files.content.get(".cpg"),
-        path=files.main,
-        count=len(geometries),
-    )
     return Layer(
         format="shapefile",
         crs=_crs(files),

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import Transformer
 
+from companion.wording import iconv
 from missions.maps.model import cut_off, map_error, write_whole
 
 # The local tangent plane of P2's maps: metres east, north and up of an origin that is chosen.
@@ -162,8 +163,9 @@ def _lines(content: bytes, path: Path) -> list[tuple[int, str]]:
         text = "\0"
     if "\0" in text:
         raise map_error(
-            path, "this is not plain text", fix="save it as plain text in UTF-8", code="encoding"
-        )
+            path, "this is not plain text", code="encoding",
+            fix=f"save it as plain text in UTF-8, or: {iconv(content, path)}",
+        )  # fmt: skip
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     return [(number, line) for number, line in enumerate(lines, 1) if line and not line.isspace()]
 

@@ -8,6 +8,7 @@ to state them.
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -20,7 +21,11 @@ Kind = Literal["volume", "mass", "flow"]
 # exactly, 1 gal = 4 qt = 8 pt = 128 fl oz (NIST Handbook 44, appendix C); the imperial gallon is
 # 4.54609 L (UK Weights and Measures Act 1985). A plain "gal" in a prescription is the US one.
 _LITRES: dict[str, tuple[float, str]] = {
-    "L": (1.0, r"l|lt|ltr|lit|lit(?:er|re)s?|升"),
+    "L": (
+        1.0,
+        r"l|lts?|ltrs?|lits?|lit(?:er|re|ro)s?|litr(?:[aiuy]|aa|ow)?|litar[ai]|"
+        r"л|л[иі]тр(?:а|и|ы|ов|ів)?|λ|λιτρ[αο]|公?升|リットル|리터",
+    ),
     "mL": (1e-3, r"ml|cc|millilit(?:er|re)s?|毫升"),
     "cL": (1e-2, r"cl|centilit(?:er|re)s?"),
     "dL": (1e-1, r"dl|decilit(?:er|re)s?"),
@@ -35,16 +40,26 @@ _LITRES: dict[str, tuple[float, str]] = {
 }
 # Hectares of each area. 1 ac = 4 046.8564224 m2 (international acre); 1 mu is 1/15 ha.
 _HECTARES: dict[str, tuple[float, str]] = {
-    "ha": (1.0, r"ha|hectares?|公顷"),
+    "ha": (
+        1.0,
+        r"has?|he[ck]tar(?:e|ea|i?a|y|i|ow)?s?|ettar[oi]|hehtaaria?|га|гектар(?:а|ів|ов)?|"
+        r"εκταρι[οα]|公顷|公頃|ヘクタール|헥타르",
+    ),
     "ac": (0.40468564224, r"ac|acres?|英亩"),
+    # 1 000 m2: the decare of Turkey (dönüm), Norway and the Balkans, Greece's stremma, Israel's
+    # dunam, and the ten ares of Japan's labels.
+    "da": (
+        0.1,
+        r"daa?|dek|dka|de[ck]ar(?:es?|a|i)?|donum|dunams?|stremmas?|στρεμμα(?:τα)?|декара?|10a|反",
+    ),
     "m2": (1e-4, r"m2|m\^2|m-2|m\^-2|sqm|squaremet(?:er|re)s?"),
     "mu": (1.0 / 15.0, r"mu|亩"),
 }
 # Kilograms of each weight; 1 lb = 0.45359237 kg exactly (NIST Handbook 44), 1 oz = 1/16 lb; the
 # short ton of 2 000 lb goes by the name of ton in the United States, so a plain ton is refused.
 _KILOGRAMS: dict[str, tuple[float, str]] = {
-    "kg": (1.0, r"kgs?|kilo(?:gram)?(?:me)?s?|公斤|千克"),
-    "g": (1e-3, r"g|grams?|gr|克"),
+    "kg": (1.0, r"kgs?|кг|kilo(?:gram)?(?:me)?s?|公斤|千克"),
+    "g": (1e-3, r"g|г|grams?|gr|克"),
     "mg": (1e-6, r"mg|milligrams?"),
     "t": (1e3, r"t|tonnes?"),
     "lb": (0.45359237, r"lbs?|pounds?"),
@@ -57,13 +72,14 @@ _MINUTES: dict[str, tuple[float, str]] = {
     "h": (60.0, r"h|hrs?|hours?"),
 }
 _MASS = r"(?:k|m|µ|u)?g|kgs?|kilo(?:gram)?s?|grams?|t|to|tons?|tonnes?|lbs?|pounds?|oz|cwt|dt"
-_SEPARATOR = r"(?:1?(?:/|per|[·.*_-]|)1?)"
+_BY = r"(?:1?(?:/|per|p[ao]r|pro|je|na|на|ανα|[·.*_-])1?)"
+_SEPARATOR = f"(?:{_BY}|1?)"
 # What is counted, measured along a line, harvested, or a part of what is weighed: units of other
 # machines' maps, which no density, width or speed turns into litres.
 _COUNTED = (
     r"(?:k|m|mio\.?|mil|thousand|million|[0-9.,])*(?:seeds?|sds|grains?|kernels?|krn|graines?|"
-    r"körner|koerner|samen|semillas?|sementes?|semi|plants?|pl|pflanzen|plantes?|plantas?|piante|"
-    r"pop(?:ulation)?|pieces?|pcs|stk|stück|bags?|粒|株)"
+    r"korner|koerner|samen|semillas?|sementes?|semi|plants?|pl|pflanzen|plantes?|plantas?|piante|"
+    r"pop(?:ulation)?|pieces?|pcs|stk|stuck|bags?|粒|株)"
 )
 _LENGTHS = r"mm|cm|dm|m|km|in|inch(?:es)?|ft|feet|foot|yd|yards?|\"|毫米|厘米|米"
 # Nutrients and active ingredients: so much of the product holds so much of them.
@@ -73,16 +89,26 @@ _PART = (
 )
 # "l ha^-1", "l.ha⁻¹", and "gal1ac-1", as ADAPT codes it; with the power no separator is needed.
 _POWER = r"\^?\(?-1\)?"
-_WHOLE = {"gpa": ("gal", "ac"), "lha": ("L", "ha"), "lpha": ("L", "ha")}
-_TIDY = str.maketrans({"²": "2", "³": "3", "⁻": "-", "¹": "1", "\N{MICRO SIGN}": "u", "'": ""})
+_WHOLE = {"gpa": ("gal", "ac"), "lha": ("L", "ha"), "lpha": ("L", "ha"), "lda": ("L", "da")}
+
+
+def bare(text: str) -> str:
+    """Return a text in lower case without accents, wide letters and powers as plain ones.
+
+    >>> bare("Dávka"), bare("m⁻²"), bare("Fläche")
+    ('davka', 'm-2', 'flache')
+    """
+    plain = unicodedata.normalize("NFKD", text.replace("\N{MICRO SIGN}", "u"))
+    marked = "".join(one for one in plain if not unicodedata.combining(one))
+    return unicodedata.normalize("NFC", marked).replace("\N{MINUS SIGN}", "-").casefold()
 
 
 def _plain(unit: str) -> str:
-    return re.sub(r"[\s\[\]]+", "", unit.translate(_TIDY).casefold())
+    return re.sub(r"[\s\[\]']+", "", bare(unit)).rstrip(".")
 
 
-def _ratio(amounts: str, areas: str) -> str:
-    return f"(?:{amounts})(?:{_SEPARATOR}(?:{areas})(?:{_POWER})?|1?(?:{areas}){_POWER})"
+def _ratio(amounts: str, bases: str, separator: str = _SEPARATOR) -> str:
+    return f"(?:{amounts})(?:{separator}(?:{bases})(?:{_POWER})?|1?(?:{bases}){_POWER})"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,8 +135,10 @@ def rate_unit(unit: str) -> RateUnit | None:
 
     >>> [(found.kind, found.name) for found in (rate_unit("kg/ha"), rate_unit("l per min"))]
     [('mass', 'kg/ha'), ('flow', 'L/min')]
-    >>> rate_unit("g/m2").factor, rate_unit("seeds/ha") is None
-    (10.0, True)
+    >>> rate_unit("g/m2").factor, rate_unit("seeds/ha"), rate_unit("litres")
+    (10.0, None, None)
+    >>> [rate_unit(text).name for text in ("Lts/Ha", "litros por hectárea", "l/dekar", "L/10a")]
+    ['L/ha', 'L/ha', 'L/da', 'L/da']
     """
     plain = _plain(unit)
     if len(plain) > 40:
@@ -119,7 +147,7 @@ def rate_unit(unit: str) -> RateUnit | None:
         for base, (size, bases_called) in bases.items():
             for amount, (content, called) in amounts.items():
                 if _WHOLE.get(plain) == (amount, base) or re.fullmatch(
-                    _ratio(called, bases_called), plain
+                    _ratio(called, bases_called, _BY if kind == "flow" else _SEPARATOR), plain
                 ):
                     return RateUnit(kind=kind, name=f"{amount}/{base}", factor=content / size)
     return None
@@ -176,6 +204,11 @@ def l_ha_per_unit(
             return None
         return rate_for_flow(found.factor, flow_speed_m_s, flow_width_m)
     return found.factor
+
+
+def is_volume(unit: str) -> bool:
+    """Tell whether this is a volume alone, without what it is spread over."""
+    return any(re.fullmatch(called, _plain(unit)[:40]) for _, called in _LITRES.values())
 
 
 def is_mass_per_area(unit: str) -> bool:
@@ -239,10 +272,24 @@ _OTHERS = _others()
 _SHORT = 2
 # Words that say what a column counts or compares, with or without a unit behind them.
 _OTHER_WORDS = {
-    "a count": {"seed", "seeds", "seeding", "plants", "kernels", "population", "graines", "körner"},
+    "a count": {"seed", "seeds", "seeding", "plants", "kernels", "population", "graines", "korner"},
     "a share": {"percent", "percentage", "pct", "prozent"},
     "a length": {"spacing", "depth"},
 }
+
+
+def _runs(name: str) -> list[str]:
+    """Return all runs of words of a name, the long ones first; of a longer text those at its end.
+
+    >>> _runs("doseLHa")
+    ['dose LHa', 'dose', 'LHa']
+    """
+    apart = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
+    words = list(re.finditer(r"[^\s_()\[\],;:-]+", apart))[-8:]
+    runs = [(first.start(), last.end()) for first in words for last in words]
+    ends = {end for _, end in runs} if len(name) <= 40 else {words[-1].end()}
+    runs = [(start, end) for start, end in runs if start < end and end in ends]
+    return [apart[start:end] for start, end in sorted(runs, key=lambda run: run[0] - run[1])]
 
 
 def quantity_in_name(column: str) -> tuple[str, str] | None:
@@ -275,18 +322,19 @@ def quantity_of_word(words: Sequence[str]) -> str | None:
 
 
 def unit_in_name(column: str) -> str | None:
-    """Return the unit that a column's name ends with, or None.
+    """Return the unit that a column's name holds, or None: `rate_l_ha`, `kg/ha`, `doseLHa`.
 
-    Only spelled-out endings count, with a separator before them: `rate_l_ha`, `Dose (L/ha)`.
+    Letters alone are a unit where nobody writes them for anything else.
 
-    >>> unit_in_name("rate_l_ha"), unit_in_name("Dose (L/ha)"), unit_in_name("rate gal/ac")
+    >>> unit_in_name("rate_l_ha"), unit_in_name("Dose (L/ha)"), unit_in_name("gal/ac rate")
     ('L/ha', 'L/ha', 'gal/ac')
-    >>> unit_in_name("rate"), unit_in_name("alpha")
-    (None, None)
+    >>> unit_in_name("rate"), unit_in_name("alpha"), unit_in_name("tac"), unit_in_name("lits")
+    (None, None, None, None)
     """
-    for start in (match.end() for match in re.finditer(r"[\s_(\[]+", column)):
-        tail = column[start:].rstrip(")] ")
-        found = rate_unit(tail)
-        if found is not None or is_mass_per_area(tail):
-            return tail if found is None else found.name
+    for run in _runs(column):
+        found = rate_unit(run)
+        if found is None and not is_mass_per_area(run):
+            continue
+        if len(run) > _SHORT + 1 or not run.isalnum() or run.casefold() in _WHOLE:
+            return run if found is None else found.name
     return None

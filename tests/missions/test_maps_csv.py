@@ -20,6 +20,7 @@ from missions.maps.csv_points import find_lattice
 from missions.maps.csvfile import read_csv
 from missions.maps.fields import Given
 from missions.maps.model import Grid, Layer
+from missions.maps.registry import read_map
 
 WEST, SOUTH = 114.543, 35.996
 
@@ -274,15 +275,16 @@ def test_every_column_of_numbers_is_a_band_and_blanks_are_none(folder: Path) -> 
 
 
 def test_units_are_taken_from_their_columns(folder: Path) -> None:
-    text = square("lat,lon,rate,unit", "1,gal/ac", "2,gal/ac", "3,", "4,gal/ac")
-    assert grid_of(write(folder, text)).unit == "gal/ac"
+    text = square("lat,lon,rate,unit", "1,gal/ac", "2,gal/ac", ",", "4,gal/ac")
+    assert read_map(write(folder, text)).unit == "gal/ac"
     text = square("lat,lon,rate,dose,dose_unit", "1,5,L/ha", "2,5,L/ha", "3,5,L/ha", "4,5,L/ha")
-    grid = grid_of(write(folder, text))
-    assert grid.unit is None
-    assert {band.name: band.unit for band in grid.bands} == {"rate": None, "dose": "L/ha"}
+    assert read_map(write(folder, text), rate_field="dose").unit == "L/ha"
+    with pytest.raises(MapError) as caught:
+        read_map(write(folder, text), rate_field="rate")
+    assert caught.value.code == "no-unit"
     text = square("lat,lon,rate,unit", "1,gal/ac", "2,L/ha", "3,L/ha", "4,L/ha")
     with pytest.raises(MapError) as caught:
-        read_csv(write(folder, text))
+        read_map(write(folder, text))
     assert caught.value.code == "unit-conflict"
 
 

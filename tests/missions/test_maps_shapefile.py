@@ -221,7 +221,7 @@ def test_a_deleted_record_does_not_shift_the_rates_of_the_others(tmp_path: Path)
     content[header + width] = ord("*")
     dbf.write_bytes(content)
     found = read_map(path)
-    assert [zone.rate_l_ha for zone in found.zones] == [1.0, None, 3.0]
+    assert [zone.rate_l_ha for zone in found.zones] == [1.0, 3.0]
 
 
 def test_shapes_out_of_order_are_found_through_the_index(tmp_path: Path) -> None:

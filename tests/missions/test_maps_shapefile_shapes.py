@@ -104,6 +104,7 @@ def test_one_shape_named_many_times_counts_each_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = simple(tmp_path)
+    path.with_suffix(".dbf").unlink()
     shx = path.with_suffix(".shx")
     content = bytearray(shx.read_bytes()[:108] + shx.read_bytes()[100:108] * 9)
     content[24:28] = struct.pack(">i", len(content) // 2)
