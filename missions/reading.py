@@ -455,7 +455,9 @@ def _own_boundary(
     asked: Asked, config: Config, table: PrescriptionTable, frame: LocalFrame
 ) -> MultiPolygon | None:
     name = table.boundary
-    return None if name is None else near_area(config.resolve(name), frame, asked.opens)
+    if name is None:
+        return None
+    return near_area(config.resolve(name), frame, asked.opens, nested=False)
 
 
 def _exclusions(

@@ -155,7 +155,9 @@ def treated_area(
     on closes what is too much. Nobody flies for pieces much smaller than a swath is wide.
     """
     if not is_journal(done):
-        return translate(local_area(told(partial(read_area, done), opens), frame), *offset_m)
+        return translate(
+            local_area(told(partial(read_area, done, nested=True), opens), frame), *offset_m
+        )
     found = read_treated_ground(done)
     field = found.setup.prescription.field
     left = rest_of(field, found.coverage, found.strip_m)

@@ -36,7 +36,7 @@ AT_SEA_DEG = 1.0
 
 # What a file leaves open, by the code of its refusal, and what answers it.
 NOTHING_TOLD: Mapping[str, str | None] = MappingProxyType({})
-ANSWERS = {"no-crs": "crs", "several-layers": "layer"}
+ANSWERS = {"no-crs": "crs", "wrong-crs": "crs", "several-layers": "layer"}
 
 
 def told(read: Callable[..., T], asked: Mapping[str, str | None]) -> T:
@@ -64,18 +64,19 @@ def outline_of(
 ) -> Area:
     """Return the field's outline; of a prescription in cells, that of its cells with a rate.
 
-    `asked` has the CRS and the layer, where they are given.
+    `asked` has the CRS and the layer, where they are given. Zones of the prescription itself may
+    lie in each other: what then holds its rule of overlaps says.
 
     Rings that cross themselves are repaired, and what that changes is added to `said`.
     """
+    same = map_file is not None and map_file.path.resolve() == path.resolve()
     try:
-        outline = told(partial(read_area, path, repairs=said), asked)
+        outline = told(partial(read_area, path, repairs=said, nested=same), asked)
         check_degrees(outline, path)
         return outline
     except MapError as error:
         if error.code != "no-polygon":
             raise
-        same = map_file is not None and map_file.path.resolve() == path.resolve()
         try:
             cells = map_file if same else told(partial(read_map, path), asked)
         except MapError:
@@ -181,9 +182,11 @@ def _of_cells(map_file: MapFile) -> MultiPolygon | Area:
     return found
 
 
-def near_area(path: Path, frame: LocalFrame, asked: Mapping[str, str | None]) -> MultiPolygon:
+def near_area(
+    path: Path, frame: LocalFrame, asked: Mapping[str, str | None], *, nested: bool = True
+) -> MultiPolygon:
     """Return the ground of a file, which must lie near the field to mean anything for it."""
-    area = told(partial(read_area, path), asked)
+    area = told(partial(read_area, path, nested=nested), asked)
     west, south, east, north = area.bounds
     check_near(str(path), (south + north) / 2.0, (west + east) / 2.0, frame)
     return area

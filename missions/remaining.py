@@ -231,7 +231,9 @@ def untreated_rates(
         found = read_treated_ground(done)
         cells = moved(found.coverage, found.frame, field.frame)
         return UntreatedRates(rates=rates, treated=cells, limit=field.kept_in)
-    area = translate(local_area(told(partial(read_area, done), opens), field.frame), *offset_m)
+    area = translate(
+        local_area(told(partial(read_area, done, nested=True), opens), field.frame), *offset_m
+    )
     shapely.prepare(area)
     return UntreatedRates(rates=rates, treated=area, limit=field.kept_in)
 

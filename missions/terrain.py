@@ -161,7 +161,7 @@ def _geotiff(path: Path) -> Dem:
     raster = read_raster(files_beside(path), path.name, layer=None, described=True)
     if len(raster.bands) != 1:
         raise PlanError(f"{path}: an elevation model has one band, not {len(raster.bands)}")
-    if raster.crs is None:
+    if not isinstance(raster.crs, CRS):
         raise PlanError(f"{path}: it does not say where it lies; export it with its CRS")
     band = raster.bands[0].band
     for one in raster.bands[0].problems:

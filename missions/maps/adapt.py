@@ -24,7 +24,7 @@ from pyproj import CRS
 from companion.errors import MapError
 from companion.wording import lack_of
 from missions.maps.bundle import Bundle, files_beside, one_of, open_bundle
-from missions.maps.crs import WGS84, parse_crs
+from missions.maps.crs import WGS84, parse_crs, stated
 from missions.maps.geopackage_layers import CurvedError, Found, areas_of, polygons_in
 from missions.maps.local import Area
 from missions.maps.model import Column, Layer, Value, check_counts, digest, map_error, read_bytes
@@ -280,7 +280,7 @@ def layer_of_parquet(
     files = {**(also or {}), name: content}
     return Layer(
         format="geoparquet" if operation is None else "adapt",
-        crs=_crs(about, path),
+        crs=stated(_crs, about, path),
         columns=columns,
         geometries=tuple(areas),
         sha256=digest(files[one] for one in sorted(files)),

@@ -15,6 +15,7 @@ import shapely
 from pyproj import CRS
 from shapely.errors import ShapelyError
 
+from companion.errors import MapError
 from missions.maps.cells import check_place, corner
 from missions.maps.crs import (
     Objects,
@@ -40,6 +41,7 @@ from missions.maps.model import (
     map_error,
     unusable_polygons,
 )
+from missions.maps.outlines import check_apart
 from missions.maps.overlaps import check_crossings
 
 # Names of zones, the best first: the first of these columns that tells all records apart.
@@ -197,16 +199,22 @@ def crs_of(layer: Layer | Grid, path: Path, asked: str | None) -> tuple[CRS, lis
     problems: list[Problem] = []
     if asked is not None:
         crs = parse_crs(asked, path=path, source=f"--crs {asked!r}")
-        if layer.crs is not None and crs_name(layer.crs) != crs_name(crs):
+        said = crs_name(layer.crs) if isinstance(layer.crs, CRS) else "nothing usable"
+        silent = layer.crs is None or getattr(layer.crs, "code", "") == "no-crs"
+        if not silent and said != crs_name(crs):
             problems.append(
                 Problem(
                     severity="warning",
                     code="crs-overridden",
-                    text=f"the file says {crs_name(layer.crs)}, but you asked for {crs_name(crs)}",
+                    text=f"the file says {said}, but you asked for {crs_name(crs)}",
                     where=str(path),
-                    fix="leave out --crs (prescription.crs) to believe the file",
+                    fix="leave out --crs (prescription.crs) to believe the file"
+                    if isinstance(layer.crs, CRS)
+                    else "check where on earth the map then lies",
                 )
             )
+    elif isinstance(layer.crs, MapError):
+        raise layer.crs
     elif layer.crs is not None:
         crs = layer.crs
     else:
@@ -334,6 +342,7 @@ def _repaired(
     if not len(broken):
         return result, []
     check_crossings(areas[broken], path)
+    check_apart(areas[broken], [f"record {names[index]}" for index in broken.tolist()], path)
     mended = [make_valid(area) for area in areas[broken]]
     frame = frame_around(areas)
     before_m2 = shapely.area(project_all(areas[broken], frame))

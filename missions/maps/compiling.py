@@ -170,7 +170,7 @@ def compile_map(
     if table.boundary is not None:
         boundary = _area(order, "prescription.boundary", table.boundary)
     exclusions = [
-        _area(order, f"prescription.exclusions[{number}]", name)
+        _area(order, f"prescription.exclusions[{number}]", name, nested=True)
         for number, name in enumerate(table.exclusions)
     ]
     exclusions += [
@@ -245,10 +245,10 @@ def flown_at(
     return rows
 
 
-def _area(order: MapOrder, key: str, name: str) -> MultiPolygon:
+def _area(order: MapOrder, key: str, name: str, *, nested: bool = False) -> MultiPolygon:
     """Return the ground that a file of the configuration covers."""
     with order.naming(key, name):
-        return read_area(order.resolve(name))
+        return read_area(order.resolve(name), nested=nested)
 
 
 def _kept_from(order: MapOrder, key: str, name: str) -> list[Geometry]:

@@ -6,6 +6,7 @@ Axis order is never guessed: shapefile and GeoJSON both store x before y, whatev
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
 from companion.errors import MapError
-from missions.maps.model import MAX_VERTICES, Problem, map_error
+from missions.maps.model import MAX_VERTICES, Problem, Stated, map_error
 
 __all__ = [
     "EXTENT_MAX_M",
@@ -31,6 +32,7 @@ __all__ = [
     "densified",
     "is_wgs84",
     "parse_crs",
+    "stated",
     "to_longitude_latitude",
 ]
 
@@ -63,6 +65,19 @@ def parse_crs(text: str, *, path: Path, source: str) -> CRS:
             fix="give it with --crs, for example --crs EPSG:4326",
             code="wrong-crs",
         ) from None
+
+
+def stated(read: Callable[..., CRS | None], *about: object) -> Stated:
+    """Return what a file says of its CRS: where that is unusable, the refusal.
+
+    Only who knows what the operator gives with --crs can tell whether it is one.
+    """
+    try:
+        return read(*about)
+    except MapError as error:
+        if error.code not in ("no-crs", "wrong-crs"):
+            raise
+        return error
 
 
 @lru_cache(maxsize=32)

@@ -22,7 +22,7 @@ from shapely.errors import ShapelyError
 
 from companion.errors import MapError
 from companion.wording import counted, iconv
-from missions.maps.crs import WGS84, parse_crs
+from missions.maps.crs import WGS84, parse_crs, stated
 from missions.maps.csv_points import Places, cells_of_coordinates, cells_of_degrees
 from missions.maps.fields import NONE, refuse_text, score
 from missions.maps.model import (
@@ -35,6 +35,7 @@ from missions.maps.model import (
     Grid,
     Layer,
     Problem,
+    Stated,
     Value,
     check_coordinates,
     check_counts,
@@ -289,7 +290,7 @@ def _ground(text: str, table: Table, index: int) -> Polygon | MultiPolygon | Non
     return area if isinstance(area, Polygon | MultiPolygon) and not area.is_empty else None
 
 
-def _crs(systems: set[str], vertices: Floats, path: Path) -> CRS | None:
+def _crs(systems: set[str], vertices: Floats, path: Path) -> Stated:
     """Return the CRS that the polygons name, else WGS84 where they can be degrees."""
     if len(systems) > 1:
         raise map_error(
@@ -300,7 +301,8 @@ def _crs(systems: set[str], vertices: Floats, path: Path) -> CRS | None:
         )
     code = next(iter(systems), "")
     if code not in ("", "0"):
-        return parse_crs(f"EPSG:{code}", path=path, source=f"its SRID {code}")
+        named = partial(parse_crs, path=path, source=f"its SRID {code}")
+        return stated(named, f"EPSG:{code}")
     return WGS84 if float(np.abs(vertices).max(initial=0.0)) <= _DEGREES_MAX else None
 
 

@@ -19,13 +19,14 @@ from shapely.geometry.base import BaseGeometry
 from companion.map_formats import geojson_feature, geojson_geometry, geojson_text
 from companion.wording import iconv
 from missions.maps.bundle import Bundle, one_of, open_bundle
-from missions.maps.crs import WGS84, crs_name, parse_crs
-from missions.maps.local import BOUNDARY_NAME, Area, as_area, outline_of
+from missions.maps.crs import WGS84, crs_name, parse_crs, stated
+from missions.maps.local import Area, as_area
 from missions.maps.model import (
     Column,
     Layer,
     MapZone,
     Problem,
+    Stated,
     Value,
     check_coordinates,
     check_counts,
@@ -34,6 +35,7 @@ from missions.maps.model import (
     read_bytes,
     write_whole,
 )
+from missions.maps.outlines import BOUNDARY_NAME, outline_of
 
 _OUTLINES = ("Polygon", "MultiPolygon")
 _COLUMNS_MAX = 255  # as many as a shapefile can have
@@ -72,7 +74,7 @@ def _layer(content: bytes, path: Path) -> Layer:
     features = _features(document, path)
     check_counts(path, records=len(features), vertices=0)
     geometries, skipped = _grounds(features, path)
-    crs, problems = _crs(document, path)
+    crs = stated(_crs, document, path)
     unit = document.get("unit")
     return Layer(
         format="geojson",
@@ -83,7 +85,7 @@ def _layer(content: bytes, path: Path) -> Layer:
         unit=unit if isinstance(unit, str) else None,
         boundary=_boundary(document, crs, path),
         skipped=skipped,
-        problems=problems,
+        problems=_old_member(crs, path),
         marks={
             index: mark
             for index in skipped
@@ -151,17 +153,17 @@ def _no_map(path: Path, text: str) -> Exception:
     return map_error(path, text, fix=_EXPORT_AGAIN, code="unknown-format")
 
 
-def _crs(document: dict[str, object], path: Path) -> tuple[CRS | None, tuple[Problem, ...]]:
+def _crs(document: dict[str, object], path: Path) -> CRS | None:
     """Return WGS84, or what the `crs` member of old files says.
 
     That member's coordinates are x before y, whatever the CRS; null says that it is unknown
     (GeoJSON 2008, sections 2.1.1 and 3).
     """
     if "crs" not in document:
-        return WGS84, ()
+        return WGS84
     member = document["crs"]
     if member is None:
-        return None, ()
+        return None
     properties = member.get("properties") if isinstance(member, dict) else None
     name = properties.get("name") if isinstance(properties, dict) else None
     if not isinstance(name, str):
@@ -173,7 +175,13 @@ def _crs(document: dict[str, object], path: Path) -> tuple[CRS | None, tuple[Pro
         )
     crs = parse_crs(name, path=path, source=f"its crs member {name[:80]!r}")
     if crs_name(crs) in ("EPSG:4326", "OGC:CRS84") or crs.name.startswith("WGS 84 (CRS84)"):
-        return WGS84, ()
+        return WGS84
+    return crs
+
+
+def _old_member(crs: Stated, path: Path) -> tuple[Problem, ...]:
+    if not isinstance(crs, CRS) or crs == WGS84:
+        return ()
     problem = Problem(
         severity="warning",
         code="old-crs-member",
@@ -182,7 +190,7 @@ def _crs(document: dict[str, object], path: Path) -> tuple[CRS | None, tuple[Pro
         where=str(path),
         fix="export the map in longitude and latitude",
     )
-    return crs, (problem,)
+    return (problem,)
 
 
 def _grounds(
@@ -208,10 +216,10 @@ def _grounds(
     return geometries, skipped
 
 
-def _boundary(document: dict[str, object], crs: CRS | None, path: Path) -> MultiPolygon | None:
+def _boundary(document: dict[str, object], crs: Stated, path: Path) -> MultiPolygon | None:
     """Return the outline of the field where our own writer has put it, beside the features."""
     member = document.get(BOUNDARY_NAME)
-    if crs is None or not isinstance(member, dict) or member.get("type") not in _OUTLINES:
+    if not isinstance(member, dict) or member.get("type") not in _OUTLINES:
         return None
     try:
         area = as_area(list(polygons_in(member)))

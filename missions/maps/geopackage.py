@@ -20,7 +20,7 @@ from shapely import MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from missions.maps.bundle import one_of, open_bundle
-from missions.maps.crs import WGS84, parse_crs
+from missions.maps.crs import WGS84, parse_crs, stated
 from missions.maps.fields import column_of, stated_unit
 from missions.maps.geopackage_layers import (
     Cell,
@@ -41,7 +41,7 @@ from missions.maps.geopackage_layers import (
     quoted,
     value_of,
 )
-from missions.maps.local import BOUNDARY_NAME, Area, outline_of
+from missions.maps.local import Area
 from missions.maps.model import (
     Column,
     Layer,
@@ -53,6 +53,7 @@ from missions.maps.model import (
     read_bytes,
     write_whole,
 )
+from missions.maps.outlines import BOUNDARY_NAME, outline_of
 
 # Bytes of the envelope by its code in the header's flags (section 2.1.3.1.1).
 _ENVELOPE_BYTES = (0, 32, 48, 48, 64)
@@ -81,13 +82,12 @@ def read_geopackage(path: Path, layer: str | None = None) -> Layer:
         tables = layers_of(database)
         chosen = chosen_layer(database, tables, layer)
         records = _content(database, chosen)
-        crs = layer_crs(database, chosen)
+        crs = stated(layer_crs, database, chosen)
         outline = next((one for one in tables if is_outline(database, one, chosen)), None)
         boundary = None
         if outline is not None:
-            outline_crs = layer_crs(database, outline)
-            if outline_crs is not None:
-                boundary = outline_of(_content(database, outline).areas, outline_crs, path)
+            areas = _content(database, outline).areas
+            boundary = outline_of(areas, stated(layer_crs, database, outline), path)
     return Layer(
         format="geopackage",
         crs=crs,
@@ -222,12 +222,12 @@ def _header(blob: bytes) -> tuple[int, int]:
 # The coordinate reference system that a GeoPackage states for a layer.
 
 # srs_id of coordinates that nobody has placed on the earth: geographic, and in a plane.
-UNDEFINED_SRS = (0, -1)
+UNDEFINED_SRS = (0, -1, 99999)
 _TEXT_MAX = 100_000
 
 
 def layer_crs(database: Database, table: LayerTable) -> CRS | None:
-    """Return the layer's CRS, None where the file leaves it open (srs_id 0 and -1)."""
+    """Return the layer's CRS, None where the file leaves it open: srs_id 0 and -1, GDAL's 99999."""
     if table.srs_id in UNDEFINED_SRS or "gpkg_spatial_ref_sys" not in database.tables:
         return None
     sql = (

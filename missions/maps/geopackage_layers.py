@@ -18,8 +18,9 @@ from shapely.errors import ShapelyError
 from shapely.geometry.base import BaseGeometry
 
 from missions.maps.fields import column_of
-from missions.maps.local import BOUNDARY_NAME, Area, as_area
+from missions.maps.local import Area, as_area
 from missions.maps.model import Value, check_coordinates, check_counts, map_error
+from missions.maps.outlines import BOUNDARY_NAME
 
 # Declared types that can hold no polygon; GEOMETRY and the others can.
 _NO_GROUND = frozenset({"POINT", "MULTIPOINT", "LINESTRING", "MULTILINESTRING"})

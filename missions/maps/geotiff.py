@@ -35,7 +35,6 @@ from missions.maps.geotiff_bands import (
     usable,
 )
 from missions.maps.geotiff_file import Raster, gdal, read_raster
-from missions.maps.local import outline_of
 from missions.maps.model import (
     Band,
     Grid,
@@ -45,6 +44,7 @@ from missions.maps.model import (
     map_error,
     write_whole,
 )
+from missions.maps.outlines import outline_of
 from missions.maps.shapefile import read_shapefile
 
 # What programs fill with lies below and above all indices, reflectances and yields.
@@ -227,13 +227,6 @@ def _boundary(
             f"record {index + 1} of the boundary is not an area: {reason}",
             fix="draw the boundary as polygons",
             code="no-polygon",
-        )
-    if layer.crs is None:
-        raise map_error(
-            where,
-            "the boundary does not say its coordinate reference system (no .prj beside it)",
-            fix="copy the whole package again",
-            code="no-crs",
         )
     content = find_shapefile(bundle.path, name).content
     files = {str(PurePosixPath(name).with_suffix(end)): part for end, part in content.items()}

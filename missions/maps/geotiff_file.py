@@ -22,7 +22,7 @@ from pyproj import CRS
 from companion.errors import MapError
 from companion.wording import lack_of
 from missions.maps.bundle import Bundle, parse_xml
-from missions.maps.crs import parse_crs
+from missions.maps.crs import parse_crs, stated
 from missions.maps.geotiff_bands import (
     RawBand,
     ReadBand,
@@ -32,7 +32,7 @@ from missions.maps.geotiff_bands import (
     read_band,
     world_file_of,
 )
-from missions.maps.model import Affine, Problem, map_error
+from missions.maps.model import Affine, Problem, Stated, map_error
 
 MAX_CELLS = 16_000_000
 MAX_BANDS = 64
@@ -69,7 +69,7 @@ _NO_PIXELS = re.compile(r"IReadBlock|Read failed")
 class Raster:
     """What a file and those beside it say: `transform` from corners of cells."""
 
-    crs: CRS | None
+    crs: Stated
     transform: Affine
     bands: tuple[ReadBand, ...]
     unit: str | None
@@ -114,7 +114,7 @@ def read_raster(
         _check_numbers(source, path)
         if not described and not colours:
             _check_no_picture(source, path)
-        crs, transform = _crs(source, path), _transform(source, path)
+        crs, transform = stated(_crs, source, path), _transform(source, path)
         tags = {key.casefold(): text for key, text in source.tags().items()}
         alpha = set() if described else _alpha(source)
         bands = tuple(
@@ -138,7 +138,7 @@ def read_raster(
 
 
 def _placed(
-    own: Affine | None, world: Affine | None, shape: tuple[int, int], crs: CRS | None, path: Path
+    own: Affine | None, world: Affine | None, shape: tuple[int, int], crs: Stated, path: Path
 ) -> tuple[Affine, tuple[Problem, ...]]:
     """Return where the cells lie: by the file itself, else by its world file."""
     if own is None and world is None:
@@ -150,7 +150,7 @@ def _placed(
         )
     if own is None or world is None:
         return own or world or _IDENTITY, ()
-    problem = difference(own, world, shape, crs, path)
+    problem = difference(own, world, shape, crs if isinstance(crs, CRS) else None, path)
     return own, () if problem is None else (problem,)
 
 

@@ -21,7 +21,6 @@ from missions.maps.crs import WGS84
 from missions.maps.fields import column_of, stated_unit
 from missions.maps.geopackage_layers import areas_of
 from missions.maps.kml_polygons import Ground, ground_of, local_name
-from missions.maps.local import BOUNDARY_NAME, outline_of
 from missions.maps.model import (
     MAX_RECORDS,
     Column,
@@ -34,6 +33,7 @@ from missions.maps.model import (
     read_bytes,
     write_whole,
 )
+from missions.maps.outlines import BOUNDARY_NAME, outline_of
 
 _CONTAINERS = ("kml", "Document", "Folder")
 

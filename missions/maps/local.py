@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
-from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 import shapely
 from pyproj import CRS, Transformer
 from shapely import Geometry, MultiPolygon, Polygon
-from shapely.errors import ShapelyError
 
 from companion.core.frame import LocalFrame
 from missions.maps.crs import (
@@ -21,9 +19,7 @@ from missions.maps.crs import (
     Floats,
     Objects,
     densified,
-    to_longitude_latitude,
 )
-from missions.maps.model import map_error
 
 Area = Polygon | MultiPolygon
 AnyArea = TypeVar("AnyArea", bound=Geometry)
@@ -127,37 +123,3 @@ def make_valid(geometry: Area) -> Area | None:
         ]
         found = shapely.intersection(found, shapely.union_all(drawn))
     return as_area(polygons_of(found))
-
-
-# The outline of the field, where a map file holds it as a layer or folder of its own.
-
-# What our writers call it, and so the name by which readers know it, in any case.
-BOUNDARY_NAME = "boundary"
-
-
-def outline_of(areas: Sequence[Area | None], crs: CRS, path: Path) -> MultiPolygon | None:
-    """Return the ground of all areas in longitude and latitude, or None where there is none.
-
-    Rings that cross are refused, not repaired: they could be the limit of spraying.
-    """
-    here = [area for area in areas if area is not None]
-    if not here:
-        return None
-    try:
-        ground = to_longitude_latitude(np.array(here, dtype=object), crs, path=path)
-        if not bool(shapely.is_valid(ground).all()):
-            raise map_error(
-                path,
-                "the rings of its boundary cross themselves",
-                fix="repair the boundary where it is made",
-                code="broken-geometry",
-            )
-        parts = polygons_of(shapely.union_all(ground))
-    except ShapelyError as error:
-        raise map_error(
-            path,
-            f"its boundary cannot be used ({str(error)[:120]})",
-            fix="repair the boundary where it is made",
-            code="broken-geometry",
-        ) from None
-    return MultiPolygon(parts) if parts else None

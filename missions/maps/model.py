@@ -162,6 +162,8 @@ MAX_VERTICES = 5_000_000
 COORDINATE_MAX = 1e9
 
 Value = str | float | None
+# A CRS; None: the file does not say; else why what it says cannot be used.
+Stated = CRS | MapError | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -185,14 +187,14 @@ class Column:
 class Layer:
     """The content of one file; None among `geometries` is explained in `skipped`.
 
-    `crs` None: the file does not say. `unit`: what the file as a whole declares. `boundary`: the
+    `unit`: what the file as a whole declares. `boundary`: the
     outline of the field, in longitude and latitude, where the file has one. `instead`: what else
     of the file could be sprayed, as an advice where this cannot. `marks` are the points and lines
     among the records that are left out, by number: trees and power lines of obstacle files.
     """
 
     format: str
-    crs: CRS | None
+    crs: Stated
     columns: tuple[Column, ...]
     geometries: tuple[Polygon | MultiPolygon | None, ...]
     sha256: str
@@ -229,7 +231,7 @@ class Grid:
     """
 
     format: str
-    crs: CRS | None
+    crs: Stated
     transform: Affine
     bands: tuple[Band, ...]
     sha256: str

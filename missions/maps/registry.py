@@ -11,7 +11,6 @@ import numpy as np
 import shapely
 from pyproj import CRS
 from shapely import MultiPolygon, Polygon
-from shapely.errors import ShapelyError
 from shapely.geometry.base import BaseGeometry
 
 from companion.core.frame import LocalFrame
@@ -41,8 +40,9 @@ from missions.maps.geotiff import (
 )
 from missions.maps.isoxml.reader import read_isoxml
 from missions.maps.kml import read_kml
-from missions.maps.local import BOUNDARY_NAME, Area, polygons_of
+from missions.maps.local import Area, polygons_of
 from missions.maps.model import Grid, Layer, MapFile, MapZone, Value, map_error
+from missions.maps.outlines import BOUNDARY_NAME, united
 from missions.maps.shapefile import read_shapefile
 from missions.maps.text_map import read_text_map
 
@@ -185,6 +185,7 @@ def read_area(
     crs: str | None = None,
     layer: str | None = None,
     repairs: list[str] | None = None,
+    nested: bool = False,
 ) -> MultiPolygon:
     """Return the ground that a boundary or exclusion file covers, in longitude and latitude.
 
@@ -192,7 +193,8 @@ def read_area(
     outline. Stricter than a prescription: a record that has to be left out, or a ring whose
     repair moves more than a square metre, could be the ground that must not be sprayed. Whoever
     gives `repairs` takes such rings repaired where that moves no more than a thousandth of their
-    ground, and finds there what each repair changed.
+    ground, and finds there what each repair changed. `nested`: its polygons may lie in each other,
+    as they may where nothing is sprayed on them.
     """
     path = Path(path)
     found = _read(path, layer)
@@ -210,13 +212,7 @@ def read_area(
             fix="draw it as a polygon",
             code="no-polygon",
         )
-    try:
-        united = shapely.union_all(np.array(ground, dtype=object))
-    except ShapelyError as error:
-        raise map_error(
-            path, f"its polygons do not unite ({error})", fix="repair them", code="broken-geometry"
-        ) from None
-    return MultiPolygon(polygons_of(united))
+    return united(ground, [f"record {name}" for name in names], path, nested=nested)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -25,9 +25,9 @@ from shapely.errors import ShapelyError
 from shapely.geometry.base import BaseGeometry
 
 from companion.map_formats import shapefile_rings, shapefile_set, table_text, zipped
-from missions.maps.crs import parse_crs
+from missions.maps.crs import parse_crs, stated
 from missions.maps.dbf import ShapeFiles, find_shapefile, read_columns
-from missions.maps.local import BOUNDARY_NAME, Area, as_area
+from missions.maps.local import Area, as_area
 from missions.maps.model import (
     MAX_RECORDS,
     Column,
@@ -40,6 +40,7 @@ from missions.maps.model import (
     not_written,
     write_whole,
 )
+from missions.maps.outlines import BOUNDARY_NAME
 
 _POLYGONS = frozenset({5, 15, 25})
 # Why a record of another type has no ground.
@@ -81,7 +82,7 @@ def read_shapefile(path: Path, layer: str | None = None) -> Layer:
     }
     return Layer(
         format="shapefile",
-        crs=_crs(files),
+        crs=stated(_crs, files),
         columns=with_units(columns, files.metadata),
         geometries=tuple(geometries),
         sha256=files.sha256,
@@ -93,8 +94,15 @@ def read_shapefile(path: Path, layer: str | None = None) -> Layer:
 
 def _crs(files: ShapeFiles) -> CRS | None:
     prj = files.content.get(".prj")
-    if prj is None or not prj.strip(b" \r\n\0"):
+    if prj is None:
         return None
+    if not prj.strip(b" \r\n\0"):
+        raise map_error(
+            files.main,
+            "its .prj is empty: the file does not say its coordinate reference system",
+            fix="give it with --crs, or copy the file again",
+            code="no-crs",
+        )
     text = prj.decode("utf-8-sig", errors="replace").strip("\0")
     return parse_crs(text, path=files.main.with_suffix(".prj"), source="its text")
 

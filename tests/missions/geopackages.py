@@ -11,7 +11,7 @@ import pytest
 import shapely
 
 from companion.errors import MapError
-from missions.maps.assemble import map_of
+from missions.maps.assemble import crs_of, map_of
 from missions.maps.fields import Given
 from missions.maps.geopackage import read_geopackage
 from missions.maps.model import Layer, MapFile
@@ -56,7 +56,7 @@ def understood(layer: Layer, path: Path) -> MapFile:
 
 def refused(path: Path, layer: str | None = None) -> MapError:
     with pytest.raises(MapError) as caught:
-        read_geopackage(path, layer)
+        crs_of(read_geopackage(path, layer), path, None)
     assert "\n" not in str(caught.value)
     assert str(caught.value).startswith(str(path))
     assert caught.value.fix

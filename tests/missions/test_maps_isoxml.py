@@ -98,7 +98,7 @@ def test_single_ring_is_the_outline_whatever_it_is_marked_as(tmp_path: Path) -> 
 def test_exterior_ring_inside_another_is_refused_as_it_may_be_a_hole(tmp_path: Path) -> None:
     both = f'<PLN A="2">{ring(LEFT)}{ring(Polygon(HOLED.interiors[0]))}</PLN>'
     error = refusal(tmp_path, task(zone(3, both, value(10))))
-    assert error.code == "broken-geometry"
+    assert error.code == "nested-polygon"
     assert "treatment zone 3" in str(error)
 
 

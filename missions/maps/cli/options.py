@@ -241,7 +241,7 @@ def _area(config: Config, name: str, key: str, problems: list[Problem]) -> Multi
     """Return a boundary or an exclusion, or None with what is wrong with it."""
     path = config.resolve(name)
     try:
-        return read_area(path)
+        return read_area(path, nested=key != "prescription.boundary")
     except MapError as error:
         if error.code == "no-file":
             note(f"{key}: {path} is not there; the map is checked without it")

@@ -16,8 +16,9 @@ from shapely.errors import ShapelyError
 from missions.maps.crs import WGS84
 from missions.maps.isoxml.task import ById, Task
 from missions.maps.isoxml.values import EXPORT_AGAIN, children, integer, number, required, text
-from missions.maps.local import Area, as_area, outline_of, polygons_of
+from missions.maps.local import Area, as_area, polygons_of
 from missions.maps.model import Affine, Problem, check_coordinates, check_counts, map_error
+from missions.maps.outlines import outline_of, united
 
 # A grid covers its field but for the cells along its edge, and sprays nothing beyond it but what
 # those cells stick out.
@@ -45,7 +46,9 @@ def field_of(root: Element, task: Task, path: Path) -> tuple[MultiPolygon | None
     polygons = children(field, "PLN")
     check_counts(path, records=len(polygons), vertices=point_count(polygons))
     ground, others = ground_of_polygons(polygons, (FIELD,), where=f"field {task.field}", path=path)
-    blocked, rest = ground_of_polygons(polygons, OBSTACLES, where=f"field {task.field}", path=path)
+    blocked, rest = ground_of_polygons(
+        polygons, OBSTACLES, where=f"field {task.field}", path=path, nested=True
+    )
     objects = others - (len(polygons) - rest)
     outline = outline_of([ground], WGS84, path)
     problems = []
@@ -165,7 +168,12 @@ _DIGITS = frozenset("0123456789+-.eE")
 
 
 def ground_of_polygons(
-    elements: Sequence[Element], types: Container[str | None], *, where: str, path: Path
+    elements: Sequence[Element],
+    types: Container[str | None],
+    *,
+    where: str,
+    path: Path,
+    nested: bool = False,
 ) -> tuple[Area | None, int]:
     """Return the ground of all polygons of the given types, and how many others were left out."""
     wanted = [one for one in elements if text(one, "A") in types]
@@ -175,7 +183,8 @@ def ground_of_polygons(
         # Polygons that touch along an edge are ground together, which is no fault; rings that
         # cross are left for the repair, which tells of them.
         if isinstance(whole, MultiPolygon) and not whole.is_valid and _valid(parts):
-            whole = as_area(polygons_of(shapely.union_all(parts)))
+            one = united(parts, [where[:60]] * len(parts), path, nested=nested)
+            whole = as_area(list(one.geoms))
     except (ValueError, ShapelyError) as error:
         raise map_error(
             path,
@@ -200,8 +209,10 @@ def _parts(element: Element) -> list[Polygon]:
     rings = children(element, "LSG")
     outer = [_ring(ring) for ring in rings if text(ring, "A") == _EXTERIOR]
     inner = [_ring(ring) for ring in rings if text(ring, "A") == _INTERIOR]
-    if len(rings) == 1 and not inner:
-        # Some terminals mark the outline as a flag or a fence; a single ring can be nothing else.
+    obstacle = text(element, "A") in OBSTACLES
+    if len(rings) == 1 and (obstacle or not inner):
+        # Some terminals mark the outline as a flag or a fence, that of an obstacle as a hole in the
+        # field; a single ring can be nothing else.
         return [Polygon(_ring(rings[0]))]
     if not outer:
         raise ValueError("it has no exterior ring")
@@ -211,11 +222,6 @@ def _parts(element: Element) -> list[Polygon]:
     holes: list[list[Floats]] = [[] for _ in outer]
     for ring in inner:
         holes[_around(shells, ring)].append(ring)
-    for index, shell in enumerate(shells):
-        own = shell.representative_point()
-        if any(other.contains(own) for other in shells[:index] + shells[index + 1 :]):
-            # One of the two may be meant as a hole, and would be sprayed.
-            raise ValueError("one exterior ring lies in another; a hole is an interior ring")
     return [Polygon(ring, own) for ring, own in zip(outer, holes, strict=True)]
 
 

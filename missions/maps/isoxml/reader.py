@@ -325,7 +325,11 @@ def _ground(
             zone.polygons, (ZONE, FIELD), where=f"treatment zone {zone.code}", path=files.path
         )
         blocked, _ = ground_of_polygons(
-            zone.polygons, OBSTACLES, where=f"treatment zone {zone.code}", path=files.path
+            zone.polygons,
+            OBSTACLES,
+            where=f"treatment zone {zone.code}",
+            path=files.path,
+            nested=True,
         )
         if ground is not None and blocked is not None and ground.is_valid and blocked.is_valid:
             ground = as_area(polygons_of(shapely.difference(ground, blocked)))

@@ -1,0 +1,197 @@
+"""Polygons inside polygons are no ground unasked, and --crs holds, in every format alike."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from shapely import MultiPolygon, Polygon, affinity, box
+
+from companion.errors import MapError
+from missions.maps.registry import read_area, read_map
+from missions.reading_outline import outline_of, told
+from tests.file_kinds import writers
+from tests.file_kinds.ground import FIELD, HOLED, ISLAND, Ground
+from tests.missions.isoxml_documents import document, field, polygon, ring, task, value, zone
+
+NESTED = MultiPolygon([FIELD, ISLAND])
+FORMATS = {name: write for name, write in writers.VECTOR.items() if name != "ISOXML"}
+every_format = pytest.mark.parametrize("write", FORMATS.values(), ids=list(FORMATS))
+
+
+def ground(*polygons: Polygon | MultiPolygon, **more: object) -> Ground:
+    columns = {"rate": [20.0] * len(polygons)}
+    return Ground(polygons=polygons, columns=columns, **more)  # type: ignore[arg-type]
+
+
+def refused(path: Path, **how: object) -> str:
+    with pytest.raises(MapError) as caught:
+        read_area(path, **how)  # type: ignore[arg-type]
+    assert caught.value.code == "nested-polygon"
+    return str(caught.value)
+
+
+@every_format
+def test_a_record_inside_another_is_no_ground_of_an_outline(
+    tmp_path: Path, write: writers.Writer
+) -> None:
+    path = write(ground(FIELD, ISLAND), tmp_path)
+    said = refused(path)
+    assert "record 2: it (400 m2 at 48.0002" in said
+    assert "lies inside record 1" in said
+    assert "--no-spray" in said
+    with pytest.raises(MapError, match="lies inside record 1"):
+        outline_of(path, None, [])
+
+
+@every_format
+def test_what_is_kept_from_spraying_may_lie_in_each_other(
+    tmp_path: Path, write: writers.Writer
+) -> None:
+    path = write(ground(FIELD, ISLAND), tmp_path)
+    whole = write(ground(FIELD), tmp_path)
+    assert read_area(path, nested=True).area == pytest.approx(read_area(whole).area)
+
+
+@every_format
+def test_a_part_inside_another_of_its_record_is_refused_in_maps_and_outlines(
+    tmp_path: Path, write: writers.Writer
+) -> None:
+    if "shapefile" in str(write.__qualname__):
+        pytest.skip("GDAL turns it into a hole")
+    path = write(ground(NESTED, affinity.translate(FIELD, 100.0)), tmp_path)
+    if path.suffix in (".shp", ".zip"):
+        return
+    assert "a polygon of it (400 m2" in refused(path)
+    with pytest.raises(MapError, match="lies inside another of it"):
+        read_map(path, unit="L/ha")
+
+
+def test_a_ring_of_a_shapefile_turned_like_its_shell_is_refused(tmp_path: Path) -> None:
+    path = FORMATS["shapefile"](ground(HOLED), tmp_path)
+    writers.turn_ring(path, 1)
+    with pytest.raises(MapError, match="lies inside another of it, and would be sprayed"):
+        read_map(path, unit="L/ha")
+
+
+@every_format
+def test_neighbours_duplicates_and_slight_overlaps_are_one_outline(
+    tmp_path: Path, write: writers.Writer
+) -> None:
+    beside, over = affinity.translate(FIELD, 60.0), affinity.translate(FIELD, 57.0)
+    one = read_area(write(ground(FIELD), tmp_path)).area
+    assert read_area(write(ground(FIELD, FIELD), tmp_path)).area == pytest.approx(one)
+    assert read_area(write(ground(FIELD, beside), tmp_path)).area == pytest.approx(2.0 * one)
+    assert read_area(write(ground(FIELD, over), tmp_path)).area == pytest.approx(1.95 * one)
+
+
+def test_a_pond_that_sticks_out_a_little_is_asked_about(tmp_path: Path) -> None:
+    pond = box(50.0, 20.0, 65.0, 40.0)
+    refused(writers.geojson_by_hand(ground(FIELD, pond), tmp_path))
+
+
+def test_a_boundary_beside_the_zones_is_under_the_same_rule(tmp_path: Path) -> None:
+    path = writers.geojson_by_hand(ground(FIELD), tmp_path)
+    content = json.loads(path.read_text())
+    nested = ground(NESTED).native()[0]
+    content["boundary"] = {
+        "type": "MultiPolygon",
+        "coordinates": [[np.array(part.exterior.coords).tolist()] for part in nested.geoms],
+    }
+    path.write_text(json.dumps(content))
+    with pytest.raises(MapError) as caught:
+        read_map(path, unit="L/ha")
+    assert caught.value.code == "nested-polygon"
+
+
+def test_zones_of_the_prescription_itself_are_left_to_its_rule_of_overlaps(tmp_path: Path) -> None:
+    path = writers.geojson_by_hand(ground(FIELD, ISLAND), tmp_path)
+    whole = outline_of(path, read_map(path, unit="L/ha"), [])
+    assert whole.area == pytest.approx(read_area(path, nested=True).area)
+
+
+# ISOXML by hand: the field and its zones.
+
+OUTER, INNER = ground(FIELD).degrees()[0], ground(ISLAND).degrees()[0]
+
+
+def written(folder: Path, *inside: str) -> Path:
+    (folder / "TASKDATA.XML").write_bytes(document(*inside))
+    return folder
+
+
+def prescribed(*polygons: str) -> str:
+    return task(zone(1, *polygons, value(2000)), more='E="PFD1"')
+
+
+@pytest.mark.parametrize(
+    "inside",
+    [polygon(OUTER) + polygon(INNER), f'<PLN A="2">{ring(OUTER)}{ring(INNER)}</PLN>'],
+    ids=["two polygons", "two exteriors"],
+)
+def test_isoxml_zones_that_lie_in_each_other_are_refused(tmp_path: Path, inside: str) -> None:
+    path = written(tmp_path, field(OUTER), prescribed(inside))
+    with pytest.raises(MapError, match=r"treatment zone 1.* lies inside another of it") as caught:
+        read_map(path, unit="L/ha")
+    assert caught.value.code == "nested-polygon"
+
+
+def test_an_isoxml_field_that_lies_in_itself_is_refused(tmp_path: Path) -> None:
+    more = f'<PFD A="PFD1" C="f">{polygon(OUTER, 1)}{polygon(INNER, 1)}</PFD>'
+    path = written(tmp_path, more, prescribed(polygon(OUTER)))
+    with pytest.raises(MapError, match="field PFD1"):
+        read_map(path, unit="L/ha")
+
+
+@pytest.mark.parametrize("kind", [1, 2, 5])
+def test_an_obstacle_of_one_ring_is_that_ring_whatever_its_type(tmp_path: Path, kind: int) -> None:
+    pond = f'<PLN A="3">{ring(INNER, kind)}</PLN>'
+    more = f'<PFD A="PFD1" C="f">{polygon(OUTER, 1)}{pond}</PFD>'
+    found = read_area(written(tmp_path, more, prescribed(polygon(OUTER))))
+    assert found.area == pytest.approx(OUTER.area - INNER.area)
+
+
+# --crs holds where what the file says is unusable.
+
+LOCAL_CS = 'LOCAL_CS["Undefined SRS",UNIT["metre",1]]'
+
+
+def local(folder: Path, kind: str) -> Path:
+    write = {"shp": "shapefile", "gpkg": "GeoPackage"}.get(kind, "GeoJSON by hand")
+    text = LOCAL_CS if kind == "gpkg" else None
+    path = FORMATS[write](ground(FIELD, crs_text=text), folder)
+    if kind == "shp":
+        path.with_suffix(".prj").write_text(LOCAL_CS)
+    elif kind == "json":
+        content = json.loads(path.read_text())
+        content["crs"] = {"type": "name", "properties": {"name": "local:1"}}
+        path.write_text(json.dumps(content))
+    return path
+
+
+@pytest.mark.parametrize("kind", ["shp", "gpkg", "json"])
+def test_what_names_no_usable_crs_is_read_in_that_of_the_operator(
+    tmp_path: Path, kind: str
+) -> None:
+    path = local(tmp_path, kind)
+    with pytest.raises(MapError, match="--crs"):
+        read_map(path, unit="L/ha")
+    found = read_map(path, unit="L/ha", crs="EPSG:4326")
+    assert found.zones[0].geometry.bounds == pytest.approx(OUTER.bounds)
+    codes = [problem.code for problem in found.problems]
+    assert codes == ([] if kind == "gpkg" else ["crs-overridden"])
+    asked = {"crs": "EPSG:4326"}
+    area = told(lambda **answers: read_area(path, **answers), asked)
+    assert area.bounds == pytest.approx(OUTER.bounds)
+
+
+def test_an_empty_prj_is_called_empty(tmp_path: Path) -> None:
+    path = local(tmp_path, "shp")
+    path.with_suffix(".prj").write_text("")
+    with pytest.raises(MapError, match=r"its \.prj is empty"):
+        read_map(path, unit="L/ha")
+    path.with_suffix(".prj").unlink()
+    with pytest.raises(MapError, match=r"no \.prj beside it"):
+        read_map(path, unit="L/ha")
