@@ -202,7 +202,7 @@ def _evaluated(journal: OpenJournal, setup: Setup, row: Row) -> Row:
     found = {**row, "is_evaluated": True, "evaluated_with": _own_version()}
     unread: list[str] = []
     try:
-        flight = flight_of(journal, setup, unread, is_sound=True)
+        flight = flight_of(journal, setup, unread)
         assessment = essentials_of(flight, marked=row["job"] is not None)
     except (EvaluationError, JournalError, ShapelyError, *DAMAGE) as error:
         # One strange flight is no reason to lose the others.

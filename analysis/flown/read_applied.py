@@ -80,34 +80,6 @@ def is_change(row: Row, valves: int) -> bool:
     )
 
 
-def numbers_of_changes(columns: Sequence[tuple[Any, ...]], valves: int) -> Floats | None:
-    """Return rows, here in columns, as numbers where surely all are changes; NaN is a missing one.
-
-    Quicker than to look at each by itself.
-    """
-    planned, actual, *others = ({*map(type, column)} for column in columns[1:])
-    if not (others == [{int}, {int}] and planned | actual <= {int, type(None)}):
-        return None
-    if type(None) in planned and type(None) in actual:
-        return None
-    table = numbers_in(columns)
-    valve, duty = table[3:]
-    is_sound = valve.min() >= 0.0 and valve.max() < valves
-    is_sound = is_sound and duty.min() >= 0.0 and duty.max() <= PERMILLE_MAX
-    return table if is_sound else None
-
-
-def numbers_in(columns: Sequence[tuple[Any, ...]]) -> Floats:
-    """Return columns of numbers, a row each; NaN is what is missing. Of rows numpy takes longer."""
-    table = np.full((len(columns), len(columns[0])), math.nan)
-    for row, column in zip(table, columns, strict=True):
-        if None not in column:
-            row[:] = np.fromiter(column, dtype=np.float64, count=len(column))
-        elif column.count(None) < len(column):
-            row[:] = np.array(column, dtype=np.float64)
-    return table
-
-
 def is_sample(row: Row) -> bool:
     """Whether a row (sequence, geom, time_s, six numbers, inhibits, rates) is a sample."""
     _, geom, time_s, *numbers, inhibits, _ = row
@@ -117,20 +89,6 @@ def is_sample(row: Row) -> bool:
         and math.isfinite(time_s)
         and all(each is None or isinstance(each, (int, float)) for each in numbers)
         and (inhibits is None or isinstance(inhibits, str))
-    )
-
-
-def are_samples(columns: Sequence[tuple[Any, ...]]) -> bool:
-    """Whether rows, here in columns, surely all are samples: quicker than each by itself."""
-    _, geom, time_s, *numbers, inhibits, _ = columns
-    return (
-        {*map(type, geom)} <= {bytes, type(None)}
-        and {*map(len, filter(None, geom))} <= {POINT_BYTES}
-        and b"" not in geom
-        and {*map(type, time_s)} == {float}
-        and all(map(math.isfinite, time_s))
-        and all({*map(type, each)} <= {int, float, type(None)} for each in numbers)
-        and {*map(type, inhibits)} <= {str, type(None)}
     )
 
 
@@ -203,14 +161,8 @@ def read_applied(path: Path, *, unread: list[str] | None = None) -> AppliedFligh
         return flight_of(journal, journal.setup(unread), unread)
 
 
-def flight_of(
-    journal: OpenJournal, setup: Setup, unread: list[str] | None, *, is_sound: bool = False
-) -> AppliedFlight:
-    """Return the flight in an open journal, whose `setup` was read; `unread` as above.
-
-    `is_sound` says that `damages` found none: then sensors' numbers are read without their texts,
-    in a tenth of the time.
-    """
+def flight_of(journal: OpenJournal, setup: Setup, unread: list[str] | None) -> AppliedFlight:
+    """Return the flight in an open journal, whose `setup` was read; `unread` as above."""
     if unread is not None:
         # A byte that is no text makes one word wrong and not a whole table.
         journal.connection.text_factory = methodcaller("decode", "utf-8", "replace")
@@ -220,7 +172,7 @@ def flight_of(
     time_s, target, flow, speed, course, heading, height = applied.columns
     latitude_deg, longitude_deg = applied.place["lat"].copy(), applied.place["lon"].copy()
     east_m, north_m = setup.frame.to_local_all(latitude_deg.tolist(), longitude_deg.tolist())
-    sensors, receiver = sensors_of(journal, names, unread, is_sound=is_sound)
+    sensors, receiver = sensors_of(journal, names, unread)
     events = _events(journal, unread)
     changes, missing = read_changes(journal, len(setup.boom.valves), names, unread)
     flight = AppliedFlight(
@@ -358,10 +310,7 @@ def read_changes(
     found = rows_of(
         journal.connection, "valve_changes", _COLUMNS, key="id", unread=unread, what=what
     )
-    columns = list(zip(*found.rows, strict=True))
-    table = numbers_of_changes(columns, valves) if columns else None
-    if table is None:
-        table = _table(sound_rows(found.rows, partial(is_change, valves=valves), unread, what))
+    table = _table(sound_rows(found.rows, partial(is_change, valves=valves), unread, what))
     changes = _changes(table)
     holes = change_holes(
         table[0].astype(np.int64),
@@ -378,7 +327,8 @@ def enumerate_rows(rows: Iterator[tuple[int | None, int | None, int, int]]) -> I
 
 
 def _table(rows: Sequence[Row]) -> Floats:
-    return numbers_in(list(zip(*rows, strict=True))) if rows else np.empty((5, 0))
+    """Return the columns of changes as numbers; NaN is what is missing."""
+    return np.array(rows, dtype=np.float64).reshape(-1, 5).T
 
 
 def _changes(table: Floats) -> ValveChanges:
@@ -445,11 +395,9 @@ def read_samples(journal: OpenJournal, valves: int, unread: list[str] | None) ->
         # Rows of one rate for all valves are one text, and there are few rates.
         if row[-1] not in rates:
             rates[row[-1]] = rates_of(row[-1], valves)
-    rows = found.rows
-    if rows and not (None not in rates.values() and are_samples(list(zip(*rows, strict=True)))):
-        rows = sound_rows(
-            rows, lambda row: is_sample(row) and rates[row[-1]] is not None, unread, "samples"
-        )
+    rows = sound_rows(
+        found.rows, lambda row: is_sample(row) and rates[row[-1]] is not None, unread, "samples"
+    )
     sequence: Ints = np.array([row[0] for row in rows], dtype=np.int64)
     holes = sample_holes(
         sequence, np.array([row[2] for row in rows], dtype=np.float64), _ends(journal)
@@ -457,7 +405,7 @@ def read_samples(journal: OpenJournal, valves: int, unread: list[str] | None) ->
     count = int(journal.meta.get("rows_applied") or 0)
     placed = [row for row in rows if row[1] is not None]
     place = np.frombuffer(b"".join([row[1] for row in placed]), dtype=_POINT)
-    columns = numbers_in(list(zip(*placed, strict=True))[2:9]) if placed else np.empty((7, 0))
+    columns = np.array([row[2:9] for row in placed], dtype=np.float64).reshape(-1, 7).T
     sound = np.isfinite(place["lat"]) & np.isfinite(place["lon"])
     order = np.flatnonzero(sound)[np.argsort(columns[0, sound], kind="stable")]
     return Samples(

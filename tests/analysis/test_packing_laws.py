@@ -8,12 +8,10 @@ import tracemalloc
 import zlib
 from contextlib import suppress
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.flown.sensor_series import Wanted, numbers_of, quick_numbers
 from analysis.journals.unpacking import part_of, unpack
 from companion.journal.rows import ROWS_MAX, TEXT_MAX, WORD, Block, Packer, pack, put_all
 
@@ -90,64 +88,6 @@ def test_content_that_is_none_is_read_or_refused(content: bytes) -> None:
         unpack(zlib.compress(content))
 
 
-MESSAGES = st.one_of(
-    st.tuples(st.just("Flow"), NUMBERS, NUMBERS | st.none(), st.sampled_from(["", "no pulses"])),
-    st.tuples(st.just("Gnss"), NUMBERS, st.integers(0, 6).map(lambda fix: {"Fix": fix})),
-    # Other kinds repeat the numbers, before and behind.
-    st.tuples(st.just("Other"), st.sampled_from([0.25, 1e300, 7.5]), NUMBERS, st.text(max_size=3)),
-)
-WANTED = {"Flow": Wanted((0, 1), 2), "Gnss": Wanted((0, 1))}
-
-
-@given(messages=st.lists(MESSAGES, max_size=40), again=st.lists(st.integers(0, 9), max_size=40))
-def test_numbers_without_their_texts_are_the_same(
-    messages: list[tuple[object, ...]], again: list[int]
-) -> None:
-    # Numbers of before come again, also those of other kinds.
-    for place in again:
-        if place < len(messages):
-            messages.append((messages[place - 1][0], *messages[place][1:]))
-    messages = [each for each in messages if len(each) == (3 if each[0] == "Gnss" else 4)]
-    messages = [each for each in messages if not isinstance(each[2], str)]
-    lines = [json.dumps({kind: values}) for kind, *values in messages]
-    try:
-        wanted = numbers_of(lines, WANTED)
-    except (OverflowError, TypeError):
-        return
-    found = quick_numbers(pack(lines), b"", WANTED)
-    if found is not None:
-        assert {kind: each.shape for kind, each in found.items()} == {
-            kind: each.shape for kind, each in wanted.items()
-        }
-        for kind, rows in wanted.items():
-            assert np.array_equal(found[kind], rows, equal_nan=True)
-
-
-def test_numbers_of_an_ordinary_block_need_no_texts() -> None:
-    lines = []
-    for number in range(400):
-        at_s = 12345.678901234 + 0.02 * number
-        lines.append(json.dumps({"Flow": [at_s, 1.25 * number, ""]}))
-        if number % 5 == 0:
-            lines.append(json.dumps({"Gnss": [at_s, {"Fix": 5 + number % 2}]}))
-            lines.append(json.dumps({"Other": [at_s + 1e-9, -at_s / 3.0, "x"]}))
-    lines.append(json.dumps({"Flow": [12400.0, None, "no pulses"]}))
-    found = quick_numbers(pack(lines), b"", WANTED)
-    assert found is not None
-    wanted = numbers_of(lines, WANTED)
-    assert len(wanted["Flow"]) == 401
-    for kind, rows in wanted.items():
-        assert np.array_equal(found[kind], rows, equal_nan=True)
-
-
-@given(junk=st.binary(max_size=60), at=st.integers(0, 200))
-def test_damage_within_numbers_is_refused_or_left_to_the_texts(junk: bytes, at: int) -> None:
-    lines = [json.dumps({"Flow": [number / 7, float(number), ""]}) for number in range(30)]
-    content = bytearray(zlib.decompress(pack(lines)))
-    content[at : at + len(junk)] = junk
-    quick_numbers(zlib.compress(bytes(content)), b"", WANTED)
-
-
 # What a stranger's file may say in a few kilobytes; each once took gigabytes or minutes.
 
 ROWS = WORD.pack(3_000_000) + WORD.pack(0) + bytes(9_000_000)
@@ -163,7 +103,6 @@ def test_a_few_bytes_take_no_more_than_a_block_may_hold(content: bytes) -> None:
     try:
         with pytest.raises(ValueError):
             unpack(packed)
-        assert quick_numbers(packed, b"", WANTED) is None
         assert tracemalloc.get_traced_memory()[1] < 60e6
     finally:
         tracemalloc.stop()
