@@ -43,7 +43,7 @@ class Config(Document):
 
     @model_validator(mode="after")
     def _agree(self) -> Self:
-        found = [(each.key, each.text) for each in contradictions(self)]
+        found = [*contradictions(self)]
         if found:
             raise PydanticCustomError(
                 "contradiction", "{text}", {"text": found[0][1], "all": found}

@@ -8,9 +8,8 @@ from __future__ import annotations
 import difflib
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from itertools import chain, pairwise
-from typing import TYPE_CHECKING
+from itertools import pairwise, starmap
+from typing import TYPE_CHECKING, NamedTuple
 
 from companion.config.sprayer_tables import own_figures
 from companion.core.nozzle import FLOW_LAWS, FlowCurve
@@ -38,41 +37,36 @@ MIX_TOLERANCE = 0.02
 _SENSOR_TABLES = frozenset({"flow_meter", "pressure", "tank", "detection"})
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Contradiction:
+class Contradiction(NamedTuple):
     """A key, what is wrong with its value, and what to write instead."""
 
     key: str
     text: str
 
 
-Rule = Iterator[Contradiction]
 Found = Iterator[tuple[str, str]]
 
 
-def contradictions(config: Document) -> list[Contradiction]:
-    """Return all that makes the configuration unusable."""
-    rules: tuple[Callable[[Document], Rule], ...] = (
+def _named(rule: Callable[[Document], Found]) -> Callable[[Document], Iterator[Contradiction]]:
+    return lambda config: starmap(Contradiction, rule(config))
+
+
+def contradictions(config: Document) -> Found:
+    """Yield all that makes the configuration unusable."""
+    rules = (
         _link, _prescription, _valves, _channels, _nozzle_sets, _pwm, _lags, _output, _safety,
-        _mission, _keyed(_lines), _keyed(_motors), _keyed(_sensors),
+        _mission, _lines, _motors, _sensors,
     )  # fmt: skip
-    found: list[Contradiction] = []
+    found = False
     for rule in rules:
         try:
             for each in rule(config):
-                found.append(each)
+                found = True
+                yield each
         except (ValueError, LookupError, ArithmeticError):
             # A rule works with what those before it have found wrong.
             if not found:
                 raise
-    return found
-
-
-def _keyed(rule: Callable[[Document], Found]) -> Callable[[Document], Rule]:
-    def keyed(config: Document) -> Rule:
-        return (Contradiction(key=key, text=text) for key, text in rule(config))
-
-    return keyed
 
 
 def _motors(config: Document) -> Found:
@@ -119,15 +113,15 @@ def _sensors(config: Document) -> Found:
         yield from sensor_contradictions(config, tank_capacity_l(config))
 
 
-def _prescription(config: Document) -> Rule:
+def _prescription(config: Document) -> Found:
     table = config.prescription
     if table is not None and (table.check_map is None) != (table.check_surveyed is None):
         here, missing = ("check_map", "check_surveyed")
         if table.check_map is None:
             here, missing = missing, here
-        yield Contradiction(
-            key=f"prescription.{here}",
-            text=f"needs prescription.{missing} as well; write the position of the mark on the "
+        yield (
+            f"prescription.{here}",
+            f"needs prescription.{missing} as well; write the position of the mark on the "
             "map and as surveyed",
         )
     rate = None if table is None else table.mix_rate
@@ -135,45 +129,43 @@ def _prescription(config: Document) -> Rule:
     if rate is None or per_l is None or config.application.product_unit != "L":
         return
     if not abs(per_l * rate - 1.0) <= MIX_TOLERANCE:
-        yield Contradiction(
-            key="prescription.mix_rate",
-            text=f"{rate:g} L of mix with 1 L of product, but application.product_per_l = "
+        yield (
+            "prescription.mix_rate",
+            f"{rate:g} L of mix with 1 L of product, but application.product_per_l = "
             f"{per_l:g} L in one; write {1.0 / rate:.4g} there, or correct mix_rate",
         )
 
 
-def mismatches(config: Document) -> Rule:
+@_named
+def mismatches(config: Document) -> Found:
     """Yield what `config check` refuses though the parts would run: a plan that is not sprayed."""
     width_m = config.boom_table.width_m
     mission, safety = config.mission, config.safety
     if mission is not None and not (
         safety.speed_min_m_s <= mission.speed_m_s <= safety.speed_max_m_s
     ):
-        yield Contradiction(
-            key="mission.speed_m_s",
-            text=f"nothing is sprayed but from safety.speed_min_m_s = {safety.speed_min_m_s:g} to "
+        yield (
+            "mission.speed_m_s",
+            f"nothing is sprayed but from safety.speed_min_m_s = {safety.speed_min_m_s:g} to "
             f"safety.speed_max_m_s = {safety.speed_max_m_s:g}; make them agree",
         )
     if mission is not None and not _near(mission.swath_width_m, width_m):
-        yield Contradiction(
-            key="mission.swath_width_m",
-            text=f"more than 2 % from boom.width_m = {width_m:g}; make the two agree",
+        yield (
+            "mission.swath_width_m",
+            f"more than 2 % from boom.width_m = {width_m:g}; make the two agree",
         )
     strips_m = {valve.name: valve.width_m for valve in config.boom().valves}
     largest = max(config.nozzle_set, key=lambda table: len(table.valves))
     sum_m = sum(strips_m[name] for name in largest.valves)
     if not _near(sum_m, width_m):
-        yield Contradiction(
-            key="boom.width_m",
-            text=f"the valve widths add up to {sum_m:g} m; correct valve[...].width_m",
-        )
+        yield "boom.width_m", f"the valve widths add up to {sum_m:g} m; correct valve[...].width_m"
     else:
         yield from _untiled(config)
     yield from _no_modes(config)
     yield from _autopilot(config)
 
 
-def _autopilot(config: Document) -> Rule:
+def _autopilot(config: Document) -> Found:
     """Yield what the autopilot that is named cannot do; of one that is not, nothing is known."""
     mission = config.mission
     if mission is None or "autopilot" not in mission.model_fields_set:
@@ -181,9 +173,9 @@ def _autopilot(config: Document) -> Rule:
     is_px4 = mission.autopilot == "px4"
     if not any(is_mode(mode, mission.autopilot) for mode in config.safety.modes):
         name, mode = ("PX4", "MISSION") if is_px4 else ("ArduPilot", "AUTO")
-        yield Contradiction(
-            key="safety.modes",
-            text=f'{name} has none of these modes, so nothing would be sprayed; write "{mode}"',
+        yield (
+            "safety.modes",
+            f'{name} has none of these modes, so nothing would be sprayed; write "{mode}"',
         )
     if not is_px4:
         return
@@ -197,18 +189,18 @@ def _autopilot(config: Document) -> Rule:
         channels |= on_autopilot(config)
     used = {key: channel for key, channel in channels.items() if channel is not None}
     if len(used) > PX4_OUTPUTS:
-        yield Contradiction(
-            key="valve",
-            text=f"{len(used)} outputs, but PX4 takes orders for {PX4_OUTPUTS}; use fewer valves, "
+        yield (
+            "valve",
+            f"{len(used)} outputs, but PX4 takes orders for {PX4_OUTPUTS}; use fewer valves, "
             "GPIO lines, or ArduPilot",
         )
         return
     for key, channel in used.items():
         if not 1 <= channel <= PX4_OUTPUTS:
-            yield Contradiction(key=key, text="PX4 numbers its actuators from 1 to 6; write one")
+            yield key, "PX4 numbers its actuators from 1 to 6; write one"
 
 
-def _untiled(config: Document) -> Rule:
+def _untiled(config: Document) -> Found:
     """Yield strips that leave ground between them or lie over each other, set by set."""
     tolerance_m = SWATH_TOLERANCE * config.boom_table.width_m
     most = max(len(table.valves) for table in config.nozzle_set)
@@ -229,42 +221,40 @@ def _untiled(config: Document) -> Rule:
                 if gap_m > 0.0
                 else f"has its strip {-gap_m:.2f} m over that"
             )
-            yield Contradiction(
-                key=f"valve[{number}].right_m",
-                text=f'{what} of valve "{left.name}"; correct valve[...].right_m, or width_m',
+            yield (
+                f"valve[{number}].right_m",
+                f'{what} of valve "{left.name}"; correct valve[...].right_m, or width_m',
             )
 
 
-def _no_modes(config: Document) -> Rule:
+def _no_modes(config: Document) -> Found:
     """Yield modes in which no vehicle ever is: with none but those, nothing would be sprayed."""
     for mode in config.safety.modes:
         if is_mode(mode):
             continue
         near = difflib.get_close_matches(mode.upper(), sorted(known_modes()), n=1, cutoff=0.5)
         advice = f'did you mean "{near[0]}"?' if near else 'write "AUTO", or "MISSION" for PX4'
-        yield Contradiction(key="safety.modes", text=f'no flight mode is named "{mode}"; {advice}')
+        yield "safety.modes", f'no flight mode is named "{mode}"; {advice}'
 
 
-def without_effect(config: Document) -> Rule:
+@_named
+def without_effect(config: Document) -> Found:
     """Yield settings that are not acted on, or work and are unwise: silence would deceive."""
     if config.flow_trim.enabled and config.flow_meter.source == "none":
-        yield Contradiction(
-            key="flow_trim.enabled",
-            text="has no effect without a flow meter; set flow_meter.source",
-        )
+        yield "flow_trim.enabled", "has no effect without a flow meter; set flow_meter.source"
     yield from _off_centre(config)
     for number, table in enumerate(config.nozzle_set):
         if table.preset is not None:
-            yield Contradiction(
-                key=f"nozzle_set[{number}].preset",
-                text="a published curve: its own authors measured up to 22 % more flow; "
+            yield (
+                f"nozzle_set[{number}].preset",
+                "a published curve: its own authors measured up to 22 % more flow; "
                 "measure yours (vrspray calibrate flow)",
             )
-    for key, text in chain(_line_warnings(config), _motor_warnings(config)):
-        yield Contradiction(key=key, text=text)
+    yield from _line_warnings(config)
+    yield from _motor_warnings(config)
 
 
-def _off_centre(config: Document) -> Rule:
+def _off_centre(config: Document) -> Found:
     """Yield a boom that is not under the aircraft: passes that alternate then do not adjoin."""
     valves = config.boom().valves
     left_m = min(valve.right_m - 0.5 * valve.width_m for valve in valves)
@@ -272,28 +262,29 @@ def _off_centre(config: Document) -> Rule:
     aside_m = 0.5 * (left_m + right_m)
     if abs(aside_m) > SWATH_TOLERANCE * config.boom_table.width_m + 1e-9:
         side = "right" if aside_m > 0.0 else "left"
-        yield Contradiction(
-            key="valve[0].right_m",
-            text=f"the middle of all strips is {abs(aside_m):.2f} m {side} of the aircraft, so "
+        yield (
+            "valve[0].right_m",
+            f"the middle of all strips is {abs(aside_m):.2f} m {side} of the aircraft, so "
             f"passes in opposite directions lie {2.0 * abs(aside_m):.2f} m too near or too far; "
             "correct valve[...].right_m",
         )
 
 
-def remarks(config: Document) -> Rule:
+@_named
+def remarks(config: Document) -> Found:
     """Yield what a reader should know of a configuration in which nothing is wrong."""
     if config.prescription is None:
-        yield Contradiction(
-            key="prescription.file",
-            text="not set: there is no map yet; `vrspray run` refuses to start until one is named",
+        yield (
+            "prescription.file",
+            "not set: there is no map yet; `vrspray run` refuses to start until one is named",
         )
     yield from unbounded(config)
     if config.output.kind == "servo":
-        yield Contradiction(key="output.guard", text="; ".join(filter(None, without_power(config))))
+        yield "output.guard", "; ".join(filter(None, without_power(config)))
     if config.flow_meter.source == "none" and config.lag.measured_on is None:
-        yield Contradiction(
-            key="flow_meter.source",
-            text="not set: `vrspray calibrate lag` needs a flow meter; without one, measure the "
+        yield (
+            "flow_meter.source",
+            "not set: `vrspray calibrate lag` needs a flow meter; without one, measure the "
             "lags with marks on the ground (`vrspray calibrate lag-marks`)",
         )
 
@@ -319,12 +310,13 @@ def without_power(config: Document) -> tuple[str, str]:
     )
 
 
-def unbounded(config: Document) -> Rule:
+@_named
+def unbounded(config: Document) -> Found:
     """Yield that no lines are named: then the map alone says where is sprayed."""
     if config.mission is None or config.mission.lines is None:
-        yield Contradiction(
-            key="mission.lines",
-            text="not set: the drone sprays the whole map wherever it flies, ferries included; "
+        yield (
+            "mission.lines",
+            "not set: the drone sprays the whole map wherever it flies, ferries included; "
             "name the plan's .lines.geojson",
         )
 
@@ -333,37 +325,31 @@ def _near(value_m: float, reference_m: float) -> bool:
     return abs(value_m - reference_m) <= SWATH_TOLERANCE * reference_m + 1e-9
 
 
-def _link(config: Document) -> Rule:
+def _link(config: Document) -> Found:
     kind, _, rest = config.link.url.partition(":")
     port = int(rest.rpartition(":")[2])
     least = 0 if kind == "udpin" else 1  # 0 lets the system choose the port to listen on
     if kind != "serial" and not least <= port <= 65535:
-        yield Contradiction(
-            key="link.url", text="has no valid port; end it with a port from 1 to 65535"
-        )
+        yield "link.url", "has no valid port; end it with a port from 1 to 65535"
 
 
-def _valves(config: Document) -> Rule:
+def _valves(config: Document) -> Found:
     seen: set[str] = set()
     for number, valve in enumerate(config.valve):
         if valve.name in seen:
-            yield Contradiction(
-                key=f"valve[{number}].name",
-                text="another valve has this name; give each its own",
-            )
+            yield f"valve[{number}].name", "another valve has this name; give each its own"
         seen.add(valve.name)
-    for key, text in own_figures(config.valve, config.lag, config.nozzle_set):
-        yield Contradiction(key=key, text=text)
+    yield from own_figures(config.valve, config.lag, config.nozzle_set)
     for number, (left, right) in enumerate(pairwise(config.valve), start=1):
         if not left.right_m < right.right_m:
-            yield Contradiction(
-                key=f"valve[{number}].right_m",
-                text=f"not to the right of valve[{number - 1}] ({left.right_m:g}); "
+            yield (
+                f"valve[{number}].right_m",
+                f"not to the right of valve[{number - 1}] ({left.right_m:g}); "
                 "order the [[valve]] tables from left to right",
             )
 
 
-def _channels(config: Document) -> Rule:
+def _channels(config: Document) -> Found:
     kind = config.output.kind
     if kind == "none":
         return
@@ -373,21 +359,19 @@ def _channels(config: Document) -> Rule:
     what = "servo output" if kind == "servo" else "GPIO line"
     for key, channel in channels.items():
         if channel is None and not config.makes_flow:
-            yield Contradiction(key=key, text=f"missing; write the {what}, {first} to {last}")
+            yield key, f"missing; write the {what}, {first} to {last}"
     if config.output.return_channel is not None:
         channels["output.return_channel"] = config.output.return_channel
     if kind == "gpio":
         channels |= _alive(config)
         if len(channels) > LINES_MAX:
-            yield Contradiction(
-                key="valve", text=f"too many valves; at most {LINES_MAX} lines are possible"
-            )
+            yield "valve", f"too many valves; at most {LINES_MAX} lines are possible"
     counts = Counter(channels.values())
     for key, channel in channels.items():
         if channel is not None and not first <= channel <= last:
-            yield Contradiction(key=key, text=f"not a {what}; write one from {first} to {last}")
+            yield key, f"not a {what}; write one from {first} to {last}"
         if channel is not None and counts[channel] > 1:
-            yield Contradiction(key=key, text=f"used twice; give each valve its own {what}")
+            yield key, f"used twice; give each valve its own {what}"
 
 
 def _alive(config: Document) -> dict[str, int | None]:
@@ -395,20 +379,20 @@ def _alive(config: Document) -> dict[str, int | None]:
     return {} if line is None else {"gpio.alive_line": line}
 
 
-def _nozzle_sets(config: Document) -> Rule:
+def _nozzle_sets(config: Document) -> Found:
     names = [valve.name for valve in config.valve]
     used: set[str] = set()
     for number, table in enumerate(config.nozzle_set):
         key = f"nozzle_set[{number}]"
         unknown = [name for name in table.valves if name not in names]
         if unknown:
-            yield Contradiction(
-                key=f"{key}.valves",
-                text=f'no valve is named "{unknown[0]}"; the valves are '
+            yield (
+                f"{key}.valves",
+                f'no valve is named "{unknown[0]}"; the valves are '
                 + ", ".join(f'"{name}"' for name in names),
             )
         if len(set(table.valves)) != len(table.valves):
-            yield Contradiction(key=f"{key}.valves", text="names a valve twice; name each once")
+            yield f"{key}.valves", "names a valve twice; name each once"
         used.update(table.valves)
         if table.preset is not None and not unknown:
             yield from _preset(config, table, key)
@@ -416,44 +400,42 @@ def _nozzle_sets(config: Document) -> Rule:
             yield from _curve(table.duty, table.flow_l_min, key)
     for number, name in enumerate(names):
         if name not in used:
-            yield Contradiction(
-                key=f"valve[{number}].name",
-                text="not in any nozzle_set.valves, so it would never open; add it there, or "
+            yield (
+                f"valve[{number}].name",
+                "not in any nozzle_set.valves, so it would never open; add it there, or "
                 "remove the valve",
             )
 
 
-def _preset(config: Document, table: NozzleSetTable, key: str) -> Rule:
+def _preset(config: Document, table: NozzleSetTable, key: str) -> Found:
     if table.duty or table.flow_l_min or config.makes_flow:
         other = "the curve of the pump" if config.makes_flow else "a row of measured points"
-        yield Contradiction(
-            key=f"{key}.preset", text=f"{other} already gives the flow; remove one of the two"
-        )
+        yield f"{key}.preset", f"{other} already gives the flow; remove one of the two"
         return
     if table.points(config.valve) == ((), ()):
         counts = " or ".join(str(law.nozzles) for law in FLOW_LAWS[table.preset or ""])
         has = table.nozzles(config.valve)
-        yield Contradiction(
-            key=f"{key}.preset",
-            text=f'"{table.preset}" is for {counts} nozzles, but this set has '
+        yield (
+            f"{key}.preset",
+            f'"{table.preset}" is for {counts} nozzles, but this set has '
             f"{'valves without valve.nozzles' if has is None else has}; correct "
             "valve[...].nozzles, "
             "or write measured points",
         )
 
 
-def _curve(duty: tuple[float, ...], flow_l_min: tuple[float, ...], key: str) -> Rule:
+def _curve(duty: tuple[float, ...], flow_l_min: tuple[float, ...], key: str) -> Found:
     for name, values in (("duty", duty), ("flow_l_min", flow_l_min)):
         if not values:
-            yield Contradiction(
-                key=f"{key}.{name}",
-                text="missing and required, unless a pump sets the flow; write the measured points",
+            yield (
+                f"{key}.{name}",
+                "missing and required, unless a pump sets the flow; write the measured points",
             )
             return
     if len(duty) != len(flow_l_min):
-        yield Contradiction(
-            key=f"{key}.flow_l_min",
-            text=f"{len(flow_l_min)} flows for {len(duty)} duties; write one flow for each duty",
+        yield (
+            f"{key}.flow_l_min",
+            f"{len(flow_l_min)} flows for {len(duty)} duties; write one flow for each duty",
         )
         return
     try:
@@ -461,82 +443,78 @@ def _curve(duty: tuple[float, ...], flow_l_min: tuple[float, ...], key: str) -> 
     except ValueError as error:
         which = "duty" if str(error).startswith("duty") else "flow_l_min"
         rule = str(error).partition(", got")[0].partition(":")[0]
-        yield Contradiction(
-            key=f"{key}.{which}", text=f"{rule}; write the measured points in order of duty"
-        )
+        yield f"{key}.{which}", f"{rule}; write the measured points in order of duty"
 
 
-def _pwm(config: Document) -> Rule:
+def _pwm(config: Document) -> Found:
     pwm = config.pwm
     if not pwm.duty_min < pwm.duty_max:
-        yield Contradiction(
-            key="pwm.duty_min", text=f"not below pwm.duty_max = {pwm.duty_max:g}; write less"
-        )
+        yield "pwm.duty_min", f"not below pwm.duty_max = {pwm.duty_max:g}; write less"
     if not pwm.min_on_s + pwm.min_off_s < 1.0 / pwm.frequency_hz:
-        yield Contradiction(
-            key="pwm.min_on_s",
-            text="with pwm.min_off_s as long as a period of "
+        yield (
+            "pwm.min_on_s",
+            "with pwm.min_off_s as long as a period of "
             f"{1.0 / pwm.frequency_hz:.4f} s; write less, or a lower pwm.frequency_hz",
         )
     if pwm.valve == "normally-open" and not config.safety.pump_cutoff:
-        yield Contradiction(
-            key="pwm.valve",
-            text="normally open valves spray when power fails; fit a relay that cuts the "
+        yield (
+            "pwm.valve",
+            "normally open valves spray when power fails; fit a relay that cuts the "
             "pump, then write safety.pump_cutoff = true",
         )
 
 
-def _lags(config: Document) -> Rule:
+def _lags(config: Document) -> Found:
     lag = config.lag
     if not lag.on_start_s <= lag.on_s:
-        yield Contradiction(
-            key="lag.on_start_s",
-            text=f"the first flow cannot come after lag.on_s = {lag.on_s:g}; write at most that",
+        yield (
+            "lag.on_start_s",
+            f"the first flow cannot come after lag.on_s = {lag.on_s:g}; write at most that",
         )
     if not lag.off_end_s >= lag.off_s:
-        yield Contradiction(
-            key="lag.off_end_s",
-            text=f"the flow cannot end before lag.off_s = {lag.off_s:g}; write at least that",
+        yield (
+            "lag.off_end_s",
+            f"the flow cannot end before lag.off_s = {lag.off_s:g}; write at least that",
         )
     for key, time_s, whole_s in (
         ("up", lag.up_time_s, lag.up_s),
         ("down", lag.down_time_s, lag.down_s),
     ):
         if not time_s <= whole_s:
-            yield Contradiction(
-                key=f"lag.{key}_time_s",
-                text=f"cannot be longer than lag.{key}_s = {whole_s:g}, which includes it; write "
+            yield (
+                f"lag.{key}_time_s",
+                f"cannot be longer than lag.{key}_s = {whole_s:g}, which includes it; write "
                 "at most that",
             )
 
 
-def _output(config: Document) -> Rule:
+def _output(config: Document) -> Found:
     output = config.output
     if not abs(output.full_us - output.closed_us) >= SPAN_MIN_US:
-        yield Contradiction(
-            key="output.full_us",
-            text=f"less than {SPAN_MIN_US} us from output.closed_us = {output.closed_us}; "
+        yield (
+            "output.full_us",
+            f"less than {SPAN_MIN_US} us from output.closed_us = {output.closed_us}; "
             "write the two ends of the driver's range, such as 1000 and 2000",
         )
     # A driver board begins a new period when the width moves by 2 % of its span.
     elif not output.dither_us < 0.02 * abs(output.full_us - output.closed_us):
-        yield Contradiction(
-            key="output.dither_us",
-            text="2 % or more of full_us - closed_us: each change would restart the PWM period of "
+        yield (
+            "output.dither_us",
+            "2 % or more of full_us - closed_us: each change would restart the PWM period of "
             "the "
             "driver board; write 8",
         )
 
 
-def _safety(config: Document) -> Rule:
+def _safety(config: Document) -> Found:
     safety = config.safety
     for what in ("speed", "height"):
         unit = "m_s" if what == "speed" else "m"
         low, high = (getattr(safety, f"{what}_{end}_{unit}") for end in ("min", "max"))
         if not low < high:
-            yield Contradiction(
-                key=f"safety.{what}_min_{unit}",
-                text=f"not below safety.{what}_max_{unit} = {high:g}; write less",
+            yield (
+                f"safety.{what}_min_{unit}",
+                f"not below safety.{what}_max_{unit} = {high:g}; write less",
             )
     usable = {
         way
@@ -546,33 +524,30 @@ def _safety(config: Document) -> Rule:
         or (way == "web" and config.web.enabled)
     }
     if not usable:
-        yield Contradiction(
-            key="safety.enable_by",
-            text='leaves no way to enable spraying; add "command", or for "rc" set '
+        yield (
+            "safety.enable_by",
+            'leaves no way to enable spraying; add "command", or for "rc" set '
             "safety.rc_channel, "
             'or for "web" set web.enabled',
         )
 
 
-def _mission(config: Document) -> Rule:
+def _mission(config: Document) -> Found:
     mission = config.mission
     if mission is not None and not mission.reserve_l < mission.tank_l:
-        yield Contradiction(
-            key="mission.reserve_l",
-            text=f"not below mission.tank_l = {mission.tank_l:g}; write less",
-        )
+        yield "mission.reserve_l", f"not below mission.tank_l = {mission.tank_l:g}; write less"
     ferry_height_m = None if mission is None else mission.ferry_height_m
     if mission is not None and ferry_height_m is not None and ferry_height_m <= mission.height_m:
-        yield Contradiction(
-            key="mission.ferry_height_m",
-            text=f"not above mission.height_m = {mission.height_m:g}; write more, or leave it out",
+        yield (
+            "mission.ferry_height_m",
+            f"not above mission.height_m = {mission.height_m:g}; write more, or leave it out",
         )
     if mission is not None and mission.lines is not None:
         half_m = 0.5 * mission.swath_width_m
         if not mission.lines_aside_m <= half_m:
-            yield Contradiction(
-                key="mission.lines_aside_m",
-                text=f"reaches the next line; write at most half a swath, {half_m:g}",
+            yield (
+                "mission.lines_aside_m",
+                f"reaches the next line; write at most half a swath, {half_m:g}",
             )
 
 
