@@ -50,9 +50,9 @@ from sitl.outputs import SERVO_FRAME_S, WIRE_S
 from sitl.own_method import MakeController, load_controller
 from sitl.profile import PROFILES, PlantProfile, load_profile
 from sitl.routes import SPEED_MAX_M_S, SPEED_MIN_M_S, legs_over, read_route
-from sitl.stub.faults import Fault, FaultClock, FaultKind, read_scenario
+from sitl.scenario_file import read_scenario
+from sitl.stub.faults import Fault, FaultClock, FaultKind
 from sitl.stub.mission_items import MODE_NAMES
-from sitl.stub.scenario import check_scenario
 from sitl.vehicle import Corners, Leg, Route, Trajectory, Vehicle
 
 if TYPE_CHECKING:
@@ -202,7 +202,6 @@ def prepare(options: FlyOptions) -> Task:
     profile = _plant(options.plant, setup)
     faults: tuple[Fault, ...] = ()
     if options.scenario is not None:
-        check_scenario(options.scenario)
         faults = read_scenario(options.scenario)
         check_on_inputs(faults, options.scenario)
     default_m_s = DEFAULT_SPEED_M_S if config.mission is None else config.mission.speed_m_s

@@ -30,6 +30,7 @@ from sitl.earth import Earth
 from sitl.follow import Along, Told, along
 from sitl.profile import FlowLaw, load_profile
 from sitl.recorded import COLUMNS, held, read_flight
+from sitl.scenario_file import load_scenario
 from sitl.serve_mission import (
     MissionWatch,
     first_course_deg,
@@ -53,7 +54,7 @@ from sitl.stub.protocol import (
     sender,
 )
 from sitl.stub.px4 import px4_parameters
-from sitl.stub.scenario import Scenario, load_scenario
+from sitl.stub.scenario import Scenario
 from sitl.stub.server import StubOptions, StubServer, TruthLog, build_autopilot, firmware_of
 from sitl.stub.sprayer import TAKE_OFF, BoardKind, LiquidOptions, Sprayer, SprayerOptions, words_of
 from sitl.stub.watchdog import Watched

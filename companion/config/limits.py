@@ -16,13 +16,10 @@ from pathlib import Path, PurePath
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, FiniteFloat, ValidationError, model_validator
-from pydantic_core import PydanticCustomError
 
-from companion.config.tables import Buffer, Rate, Table, Text, Texts
-from companion.config.wording import findings, one_line
+from companion.config.tables import Buffer, Rate, Table, Text, Texts, contradiction
 from companion.core.label import LabelLimits, Span, is_from
 from companion.core.types import Inhibit
-from companion.errors import ConfigError
 from companion.wording import read_toml
 
 # Where the journal keeps them.
@@ -122,18 +119,18 @@ class LimitsFile(Table):
             low, high = self.ends(name)
             if low is not None and high is not None and not low <= high:
                 key, _, unit = name.partition("_")
-                raise _contradiction(f"{key}_min_{unit}", f"above {key}_max_{unit} = {high:g}")
+                raise contradiction((f"{key}_min_{unit}", f"above {key}_max_{unit} = {high:g}"))
         if (self.hours or self.first_day or self.last_day) and self.utc_offset is None:
-            raise _contradiction("utc_offset", "missing; hours and days need it, such as +02:00")
+            raise contradiction(("utc_offset", "missing; hours and days need it, such as +02:00"))
         for name in ("first_day", "last_day"):
             try:
                 date.fromisoformat(getattr(self, name) or "2000-01-01")
             except ValueError:
-                raise _contradiction(name, "no such day; write YYYY-MM-DD") from None
+                raise contradiction((name, "no such day; write YYYY-MM-DD")) from None
         if self.first_day and self.last_day and self.first_day > self.last_day:
-            raise _contradiction("first_day", f"after last_day = {self.last_day}")
+            raise contradiction(("first_day", f"after last_day = {self.last_day}"))
         if any(text[:5] == text[6:] for text in self.hours):
-            raise _contradiction("hours", "a span of no time; leave hours out for the whole day")
+            raise contradiction(("hours", "a span of no time; leave hours out for the whole day"))
         return self
 
     def as_meta(self) -> dict[str, str]:
@@ -275,10 +272,6 @@ class Declared:
     is_kept: bool
 
 
-def _contradiction(key: str, text: str) -> PydanticCustomError:
-    return PydanticCustomError("contradiction", "{text}", {"text": text, "all": [(key, text)]})
-
-
 def _second(clock: str) -> float:
     return int(clock[:2]) * 3600.0 + int(clock[3:]) * 60.0
 
@@ -321,9 +314,4 @@ def read_limits(path: Path, named: str) -> LimitsFile:
         ConfigError: in one line: file, key, value, what to write instead.
     """
     _, raw = read_toml(path, what="label and permit", named=named)
-    try:
-        return LimitsFile.model_validate(raw)
-    except ValidationError as error:
-        raise ConfigError(
-            f"{path}: {one_line(findings(error.errors(), raw, LimitsFile))}"
-        ) from error
+    return LimitsFile.checked(raw, path)

@@ -9,12 +9,12 @@ from datetime import date, time
 from pathlib import Path
 from typing import Any, Self
 
-from pydantic import ValidationError, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic import model_validator
 
 from companion.config.application_table import told
 from companion.config.document import Document, Origin, leaves
 from companion.config.rules import contradictions
+from companion.config.tables import contradiction
 from companion.core.nozzle import FlowCurve, NozzleSet
 from companion.core.options.drift import Drift, blowing, fall_s
 from companion.core.safety import Limits
@@ -45,9 +45,7 @@ class Config(Document):
     def _agree(self) -> Self:
         found = [*contradictions(self)]
         if found:
-            raise PydanticCustomError(
-                "contradiction", "{text}", {"text": found[0][1], "all": found}
-            )
+            raise contradiction(*found)
         return self
 
     def nozzle_sets(self) -> tuple[NozzleSet, ...]:
@@ -211,15 +209,7 @@ def load(path: Path, *, overrides: Sequence[str] = ()) -> Config:
             raise ConfigError(
                 f"{path}: {key} = {show_value(value)}: a NUL character; write the text without it"
             )
-    try:
-        config = Config.model_validate(raw)
-    except ValidationError as error:
-        from companion.config.wording import findings, one_line
-
-        found = findings(error.errors(), raw, Config)
-        raise ConfigError(
-            f"{path}: {one_line(found)}", problems=[each.problem() for each in found]
-        ) from error
+    config = Config.checked(raw, path)
     name, label = config.limits_table.file, None
     if name is not None:
         from companion.config.limits import read_limits

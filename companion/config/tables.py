@@ -8,6 +8,7 @@ corrections and of the sensors have files of their own.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import (
@@ -20,6 +21,8 @@ from pydantic import (
     model_validator,
 )
 from pydantic_core import PydanticCustomError
+
+from companion.errors import ConfigError
 
 Text = Annotated[str, Field(min_length=1, max_length=500)]
 Texts = Annotated[tuple[Text, ...], Field(strict=False, max_length=1000)]
@@ -45,6 +48,28 @@ class Table(BaseModel):
     """A table of the file: frozen, strict, nothing unknown."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+    @classmethod
+    def checked(cls, raw: dict[str, Any], where: Path | str) -> Self:
+        """Return what a file, or a table of it, says.
+
+        Raises:
+            ConfigError: in one line: file, key, value, what to write instead.
+        """
+        try:
+            return cls.model_validate(raw)
+        except ValidationError as error:
+            from companion.config.wording import findings, one_line
+
+            found = findings(error.errors(), raw, cls)
+            raise ConfigError(
+                f"{where}: {one_line(found)}", problems=[each.problem() for each in found]
+            ) from error
+
+
+def contradiction(*found: tuple[str, str]) -> PydanticCustomError:
+    """Return what refuses a table whose keys, each with what is wrong, do not go together."""
+    return PydanticCustomError("contradiction", "{text}", {"text": found[0][1], "all": found})
 
 
 class LinkTable(Table):

@@ -35,6 +35,7 @@ WRONG = {
     "string_too_short": "empty",
     "string_too_long": "too long",
     "literal_error": "not known",
+    "enum": "not known",
     "greater_than": "out of range",
     "greater_than_equal": "out of range",
     "less_than": "out of range",
@@ -108,22 +109,24 @@ def _schema_of(model: type[BaseModel]) -> dict[str, Any]:
 
 
 def _of_error(error: ErrorDetails, raw: dict[str, Any], schema: dict[str, Any]) -> Iterator[Found]:
+    steps, value = _locate(error["loc"], raw)
+    key = dotted(steps)
     if error["type"] == "contradiction":
-        for key, text in error["ctx"]["all"]:
+        for inner, text in error["ctx"]["all"]:
+            key = dotted(steps) + "." + inner if steps else inner
             value = _lookup(raw, key)
             shown = None if value is None else show_value(value)
             wrong, _, fix = text.partition("; ")
             yield Found(key, shown, "contradiction", wrong, fix)
         return
-    steps, value = _locate(error["loc"], raw)
-    key = dotted(steps)
     if error["type"] == "extra_forbidden":
         yield Found(key, show_value(value), "unknown-key", "unknown key", _nearest(steps, schema))
         return
     node = _schema_at(steps, schema)
     allowed = f"write {allowed_text(node, schema, str(steps[-1]))}"
     if node.get("description"):
-        allowed += f" ({node['description']})"
+        meaning = node["description"].splitlines()[0]
+        allowed += f" ({meaning})"
     wrong = WRONG.get(error["type"], error["msg"])
     if error["type"] == "missing":
         yield Found(key, None, "missing", "missing", allowed)
@@ -188,7 +191,7 @@ def _schema_at(steps: Sequence[str | int], schema: dict[str, Any]) -> dict[str, 
     for step in steps:
         child = node.get("items", {}) if isinstance(step, int) else None
         if child is None:
-            child = node.get("properties", {}).get(step, {})
+            child = node.get("properties", {}).get(step) or node.get("additionalProperties") or {}
         elif "prefixItems" in node and isinstance(step, int) and step < len(node["prefixItems"]):
             child = node["prefixItems"][step]
         node = _resolved(child, schema)

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import tomllib
-from collections.abc import Iterable
-from dataclasses import dataclass, fields
 from enum import StrEnum
-from pathlib import Path
-from typing import Any
+from typing import Literal, Self
 
-from companion.errors import ConfigError
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
 
 
 class FaultKind(StrEnum):
@@ -52,8 +49,8 @@ class FaultKind(StrEnum):
 
 
 # The keys that mean something to a kind, beside when it is; of the others a file may set none.
-_WHEN = ("kind", "at_s", "duration_s", "since")
-_KEYS: dict[FaultKind, tuple[str, ...]] = {
+_WHEN = {"kind", "at_s", "duration_s", "since"}
+KEYS: dict[FaultKind, tuple[str, ...]] = {
     FaultKind.ACK_LOST: ("fraction", "command"),
     FaultKind.ACK_LATE: ("fraction", "command", "delay_s"),
     FaultKind.ACK_DOUBLED: ("fraction", "command"),
@@ -76,8 +73,18 @@ _KEYS: dict[FaultKind, tuple[str, ...]] = {
 }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Fault:
+class Strict(BaseModel):
+    """A table of a scenario file, read as those of the configuration are."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+def contradiction(key: str, text: str) -> PydanticCustomError:
+    """Return what refuses a table for one of its keys."""
+    return PydanticCustomError("contradiction", "{text}", {"text": text, "all": [(key, text)]})
+
+
+class Fault(Strict):
     """One fault: `at_s` counts from the start of the stub, or from `since = "take-off"`.
 
     `fraction` is of the messages concerned; `delay_s` is of late acknowledgements, of the clock's
@@ -86,35 +93,26 @@ class Fault:
     one concerned, 0 is every command; `channel` and `pulse_us` are of the transmitter.
     """
 
-    kind: FaultKind
-    at_s: float = 0.0
-    duration_s: float = 1e9
-    since: str = "start"
-    fraction: float = 1.0
-    delay_s: float = 1.0
-    factor: float = 4.0
+    kind: FaultKind = Field(strict=False)
+    at_s: float = Field(default=0.0, ge=0.0, lt=1e9)
+    duration_s: float = Field(default=1e9, gt=0.0, le=1e9)
+    since: Literal["start", "take-off"] = "start"
+    fraction: float = Field(default=1.0, ge=0.0, le=1.0)
+    delay_s: float = Field(default=1.0, ge=0.0, le=3600.0)
+    factor: float = Field(default=4.0, ge=1.0, le=100.0)
     mode: int = 5
     fix: int = 1
-    command: int = 0
-    rate_hz: float = 2.0
-    channel: int = 8
-    pulse_us: int = 2000
+    command: int = Field(default=0, ge=0, le=65535)
+    rate_hz: float = Field(default=2.0, ge=0.0, le=400.0)
+    channel: int = Field(default=8, ge=1, le=18)
+    pulse_us: int = Field(default=2000, ge=800, le=2200)
 
-    def __post_init__(self) -> None:
-        if not (0.0 <= self.at_s < 1e9 and 0.0 < self.duration_s <= 1e9):
-            raise ValueError(
-                f"at_s and duration_s must be times, got {self.at_s}, {self.duration_s}"
-            )
-        if self.since not in ("start", "take-off"):
-            raise ValueError(f"since must be 'start' or 'take-off', got {self.since!r}")
-        if not 0.0 <= self.fraction <= 1.0:
-            raise ValueError(f"fraction must lie in [0, 1], got {self.fraction}")
-        if not (0.0 <= self.delay_s <= 3600.0 and 1.0 <= self.factor <= 100.0):
-            raise ValueError(f"delay_s {self.delay_s} or factor {self.factor} is out of range")
-        if not (0.0 <= self.rate_hz <= 400.0 and 0 <= self.command <= 65535):
-            raise ValueError(f"rate_hz {self.rate_hz} or command {self.command} is out of range")
-        if not (1 <= self.channel <= 18 and 800 <= self.pulse_us <= 2200):
-            raise ValueError(f"channel {self.channel} or pulse_us {self.pulse_us} is out of range")
+    @model_validator(mode="after")
+    def _means_something(self) -> Self:
+        idle = self.model_fields_set - _WHEN - {*KEYS.get(self.kind, ())}
+        if idle:
+            raise contradiction(min(idle), f"means nothing to kind '{self.kind}'")
+        return self
 
 
 class FaultClock:
@@ -147,65 +145,6 @@ class FaultClock:
         if since_s is None:
             return False
         return fault.at_s <= now_s - since_s < fault.at_s + fault.duration_s
-
-
-def read_scenario(path: Path) -> tuple[Fault, ...]:
-    """Return the faults of a scenario file that holds nothing else."""
-    table = read_table(path)
-    others = sorted(set(table) - {"fault"})
-    if others:
-        raise ConfigError(f"{path}: {others[0]}: only [[fault]] has a meaning here")
-    return read_faults(path, table)
-
-
-def read_table(path: Path) -> dict[str, Any]:
-    """Return what a scenario file holds."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read as a scenario ({error})") from error
-
-
-def read_faults(path: Path, table: dict[str, Any]) -> tuple[Fault, ...]:
-    """Return the faults of a scenario."""
-    return tuple(_fault(path, number, each) for number, each in tables_of(path, table, "fault"))
-
-
-def tables_of(path: Path, table: dict[str, Any], name: str) -> Iterable[tuple[int, dict[str, Any]]]:
-    """Return the numbered tables [[name]] of a scenario."""
-    entries = table.get(name, [])
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise ConfigError(f"{path}: {name}: write it as [[{name}]], one table each")
-    return enumerate(entries)
-
-
-def _fault(path: Path, number: int, entry: dict[str, Any]) -> Fault:
-    kinds_of = {field.name: field.type for field in fields(Fault)}
-    names = set(kinds_of)
-    unknown = sorted(set(entry) - names)
-    if unknown:
-        raise ConfigError(
-            f"{path}: fault[{number}].{unknown[0]}: unknown key; known: {sorted(names)}"
-        )
-    try:
-        kind = FaultKind(entry.get("kind", ""))
-        for name, value in entry.items():
-            _check_type(name, value, str(kinds_of[name]))
-        fault = Fault(**{**entry, "kind": kind})
-    except (ValueError, TypeError) as error:
-        kinds = ", ".join(FaultKind)
-        raise ConfigError(f"{path}: fault[{number}]: {error}; kinds: {kinds}") from error
-    idle = sorted(set(entry) - {*_WHEN, *_KEYS.get(kind, ())})
-    if idle:
-        raise ConfigError(f"{path}: fault[{number}].{idle[0]}: means nothing to kind '{kind}'")
-    return fault
-
-
-def _check_type(name: str, value: object, kind: str) -> None:
-    """Refuse what is no number where a number is wanted; a truth value is none."""
-    wanted: tuple[type, ...] = {"float": (int, float), "int": (int,)}.get(kind, (str,))
-    if isinstance(value, bool) or not isinstance(value, wanted):
-        raise ValueError(f"{name} must be of type {wanted[-1].__name__}, got {value!r}")
 
 
 # The pilot's transmitter: sticks in the middle, switches low, unless a fault moves them.

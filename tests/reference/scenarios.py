@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from companion.config.wording import _schema_at
 from sitl.liquid_faults import LiquidFaultKind
-from sitl.stub.faults import _KEYS, FaultKind
-from sitl.stub.scenario import _KNOWN, _LIMITS
+from sitl.scenario_file import ScenarioFile
+from sitl.stub.faults import KEYS, FaultKind
 
 INTRODUCTION = """# Scenario files
 
@@ -87,10 +88,12 @@ LIQUID: dict[LiquidFaultKind, str] = {
 def page() -> str:
     """Return the page; KeyError for a key or a fault that is not described."""
     parts = [INTRODUCTION, "## Tables\n\n| Key | Meaning | Range |\n|---|---|---|"]
-    for table, keys in _KNOWN.items():
-        for key in keys:
-            low_high = _LIMITS.get(key)
-            limits = "" if low_high is None else f"{low_high[0]:g} to {low_high[1]:g}"
+    schema = ScenarioFile.model_json_schema()
+    for table in schema["properties"]:
+        for key in _schema_at([table], schema).get("properties", {}):
+            node = _schema_at([table, key], schema)
+            low_high = node.get("minimum"), node.get("maximum")
+            limits = "" if None in low_high else "{:g} to {:g}".format(*low_high)
             parts.append(f"| `{table}.{key}` | {MEANINGS[f'{table}.{key}']} | {limits} |")
     parts.append(
         "| `parameters.NAME` | an autopilot's parameter at the start, such as `SERVO9_FUNCTION = 94` | |"
@@ -101,7 +104,7 @@ def page() -> str:
         "| Kind | Further keys | What happens |\n|---|---|---|"
     )
     for kind, meaning in FAULTS.items():
-        keys = ", ".join(f"`{key}`" for key in _KEYS.get(kind, ()))
+        keys = ", ".join(f"`{key}`" for key in KEYS.get(kind, ()))
         parts.append(f"| `{kind.value}` | {keys} | {meaning} |")
     parts.append(
         "\n## Faults of the liquid\n\nA `[[liquid]]` table acts on the sprayer, its sensors and its truth from "

@@ -284,7 +284,8 @@ def test_a_scenario_that_is_not_there_is_named_with_its_option(
     short_mission: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert execute(command(short_mission, "--scenario", "nope.toml")) == 2
-    assert capsys.readouterr().err == "error: --scenario nope.toml: no such file\n"
+    error = "--scenario nope.toml: no such file or directory; give the .toml file of a scenario"
+    assert capsys.readouterr().err == f"error: {error}\n"
 
 
 def test_an_unknown_kind_of_fault_is_refused_with_the_known_ones(

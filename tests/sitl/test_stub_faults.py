@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 
 from companion.errors import ConfigError
-from sitl.stub.faults import Fault, FaultKind, read_scenario
+from sitl.scenario_file import read_scenario
+from sitl.stub.faults import Fault, FaultKind
 from sitl.stub.mission_items import AUTO, LOITER, Phase
 from sitl.stub.protocol import dialect
 from tests.sitl.stub_bench import Bench, mission
@@ -227,19 +228,25 @@ def test_a_scenario_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("[[fault]]\n", "kinds: ack-lost"),
+        ("[[fault]]\n", 'kind: missing; write one of "ack-lost", '),
         ('[[fault]]\nkind = "gremlins"\n', "gremlins"),
-        ('[[fault]]\nkind = "silence"\nwhen = 3\n', r"fault\[0\].when: unknown key"),
+        (
+            '[[fault]]\nkind = "silence"\nwhen = 3\n',
+            r"fault\[0\].when = 3: unknown key; .* can have: kind, at_s",
+        ),
         ('[[fault]]\nkind = "silence"\nfraction = 2.0\n', "fraction"),
         ('[[fault]]\nkind = "silence"\nat_s = nan\n', "at_s"),
-        ('[[fault]]\nkind = "silence"\nat_s = "soon"\n', "at_s must be of type float"),
-        ('[[fault]]\nkind = "gps-drop"\nfix = 1.5\n', "fix must be of type int"),
-        ('[[fault]]\nkind = "silence"\nfactor = 2.0\n', "factor: means nothing to kind"),
+        ('[[fault]]\nkind = "silence"\nat_s = "soon"\n', 'at_s = "soon": not a number'),
+        ('[[fault]]\nkind = "gps-drop"\nfix = 1.5\n', "fix = 1.5: not a whole number"),
+        (
+            '[[fault]]\nkind = "silence"\nfactor = 2.0\n',
+            r"fault\[0\].factor = 2.0: means nothing to kind",
+        ),
         ('[[fault]]\nkind = "rc"\npulse_us = 9000\n', "pulse_us"),
         ("[wind]\nspeed_m_s = 3.0\n", "wind: only"),
-        ("fault = 3\n", "one table each"),
-        ("fault = [3]\n", "one table each"),
-        ("fault = [\n", "cannot be read"),
+        ("fault = 3\n", r"write \[\[fault\]\] tables"),
+        ("fault = [3]\n", r"fault\[0\] = 3: not a table"),
+        ("fault = [\n", "not valid TOML"),
     ],
 )
 def test_a_broken_scenario_is_refused_in_one_line(tmp_path: Path, text: str, said: str) -> None:

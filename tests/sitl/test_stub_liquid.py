@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from companion.errors import ConfigError
 from companion.sensors import CurrentLoop, IioVoltage
 from sitl.liquid_faults import LiquidFaultKind, healthy_kpa
+from sitl.scenario_file import load_scenario
 from sitl.serve import ServeOptions, serve
 from sitl.stub.outputs import ServoOrder
 from sitl.stub.protocol import dialect
-from sitl.stub.scenario import load_scenario
 from sitl.stub.server import StubOptions, build_autopilot
 from sitl.stub.sprayer import FLIGHT_BATTERY, LiquidEntry, LiquidOptions, Sprayer, SprayerOptions
 from tests.sitl.stub_bench import HOME
@@ -76,20 +76,35 @@ def test_a_scenario_says_what_goes_wrong_and_who_sees_it(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("liquid = 3", r"liquid: write it as \[\[liquid\]\]"),
-        ('[[liquid]]\nkind = "clogged"', r"liquid\[0\].kind = 'clogged': known kinds: clog, "),
-        ('[[liquid]]\nkind = "clog"', "share = 0.0: give more than 0"),
-        ('[[liquid]]\nkind = "clog"\nshare = "much"', "liquid.0..share = 'much': give a number"),
-        ('[[liquid]]\nkind = "clog"\nshare = 0.5\nvalve = 0', "valve = 0: 1 is the leftmost"),
-        ('[[liquid]]\nkind = "stuck-open"', "valve is missing"),
-        ('[[liquid]]\nkind = "air"\nshare = 0.5', "share means nothing to kind 'air'"),
-        ('[[liquid]]\nkind = "leak"\nshare = 0.5\nvalve = 1', "valve means nothing"),
-        ('[[liquid]]\nkind = "air"\nsince = "noon"', "since must be one of start, take-off"),
-        ('[[liquid]]\nkind = "air"\nat_s = -1', "at_s must be a time"),
-        ('[[liquid]]\nkind = "air"\nduration_s = 1', "duration_s: unknown key"),
-        ("[sensors]\nmeter_battery = 1.5", "meter_battery = 1.5: give a whole number"),
-        ("[sensors]\nmeter_battery = 16", "meter_battery = 16: give 0 to 15"),
-        ("[sensors]\nmeter = 1", "sensors.meter: unknown key"),
+        ("liquid = 3", r"liquid = 3: not a list; write \[\[liquid\]\] tables"),
+        (
+            '[[liquid]]\nkind = "clogged"',
+            r'liquid\[0\].kind = "clogged": not known; write one of "clog", ',
+        ),
+        ('[[liquid]]\nkind = "clog"', "share: no share; give more than 0, up to 1"),
+        ('[[liquid]]\nkind = "clog"\nshare = "much"', 'liquid.0..share = "much": not a number'),
+        (
+            '[[liquid]]\nkind = "clog"\nshare = 0.5\nvalve = 0',
+            "valve = 0: out of range; .* from 1 .1 is the leftmost",
+        ),
+        ('[[liquid]]\nkind = "stuck-open"', "valve: missing; 1 is the leftmost"),
+        ('[[liquid]]\nkind = "air"\nshare = 0.5', "share = 0.5: means nothing to kind 'air'"),
+        ('[[liquid]]\nkind = "leak"\nshare = 0.5\nvalve = 1', "valve = 1: means nothing"),
+        (
+            '[[liquid]]\nkind = "air"\nsince = "noon"',
+            'since = "noon": not known; write one of "start", "take-off", "spraying"',
+        ),
+        ('[[liquid]]\nkind = "air"\nat_s = -1', "at_s = -1: out of range"),
+        ('[[liquid]]\nkind = "air"\nduration_s = 1', "duration_s = 1: unknown key"),
+        ("[sensors]\nmeter_battery = 1.5", "meter_battery = 1.5: not a whole number"),
+        (
+            "[sensors]\nmeter_battery = 16",
+            "meter_battery = 16: out of range; write a whole number from 0 to 15",
+        ),
+        (
+            "[sensors]\nmeter = 1",
+            "sensors.meter = 1: unknown key; did you mean sensors.meter_battery",
+        ),
     ],
 )
 def test_what_has_no_meaning_is_refused(tmp_path: Path, text: str, said: str) -> None:
