@@ -13,12 +13,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from companion.config import load
+from companion.config.tables import Table, Text
 from companion.errors import ConfigError
 from companion.wording import missing, read_toml
 from sitl.anyang import EXAMPLE
@@ -35,15 +37,13 @@ from sitl.campaign.settings import (
 )
 
 VERSION = 1
-GRID, HYPERCUBE, SOBOL, MORRIS = "grid", "latin-hypercube", "sobol", "morris"
-KINDS = (GRID, HYPERCUBE, SOBOL, MORRIS)
+DesignKind = Literal["grid", "latin-hypercube", "sobol", "morris"]
+GRID: DesignKind = "grid"
+HYPERCUBE, SOBOL, MORRIS = "latin-hypercube", "sobol", "morris"
 FLIGHTS_MAX = 10_000_000
 MORRIS_LEVELS = 4
 EXAMPLE_CONFIG = EXAMPLE / "config.toml"
 TRIED_MAX = 20
-TOP = ("version", "name", "seeds", "fixed", "design", "vary", "case")
-OF_DESIGN = ("kind", "samples", "seed", "second_order")
-OF_FACTOR = ("set", "values", "low", "high", "steps")
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,6 +193,38 @@ def _for_sensitivity(campaign: Campaign) -> NDArray[np.float64]:
 
 # ------------------------------------------------------------------------------------------ reading
 
+Whole = Annotated[int, Field(ge=0)]
+
+
+class _Seeds(Table):
+    first: Whole = 1
+    count: int = Field(ge=1, le=FLIGHTS_MAX)
+
+
+class _Design(Table):
+    kind: DesignKind = GRID
+    samples: Whole = 0
+    seed: Whole = 1
+    second_order: bool = False
+
+
+class _Vary(Table):
+    set: Text
+    values: list[Any] | None = Field(default=None, min_length=1)
+    low: float | None = None
+    high: float | None = None
+    steps: int | None = Field(default=None, ge=2)
+
+
+class _File(Table):
+    version: int = Field(ge=VERSION, le=VERSION)
+    name: Text | None = None
+    seeds: Any = 1
+    fixed: dict[str, Any] = Field(default={})
+    design: _Design = _Design()
+    vary: list[_Vary] = Field(default=[])
+    case: list[dict[str, Any]] = Field(default=[])
+
 
 def read_campaign(path: Path, *, checked: bool = True) -> Campaign:
     """Read a campaign file; without `checked` the other files that it names may be gone.
@@ -200,43 +232,26 @@ def read_campaign(path: Path, *, checked: bool = True) -> Campaign:
     Raises:
         ConfigError: in one line: file, key, value, what to write instead.
     """
-    text, table = read_toml(path, what="a campaign")
+    text, raw = read_toml(path, what="a campaign")
+    file = _File.checked(raw, path)
     try:
-        found = _campaign(path, text, table)
+        found = Campaign(
+            path=path,
+            text=text,
+            name=file.name or path.stem,
+            seeds=_seeds(file.seeds),
+            fixed=_settings(file.fixed, "fixed"),
+            factors=tuple(_factor(each, n) for n, each in enumerate(file.vary)),
+            cases=_cases(file.case),
+            **file.design.model_dump(),
+        )
+        _check_design(found)
+        _check_settings(found)
         if checked:
             _check_configuration(found)
         return found
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
-
-
-def _campaign(path: Path, text: str, table: Mapping[str, Any]) -> Campaign:
-    _refuse_unknown(table, TOP, "")
-    if table.get("version") != VERSION:
-        said = f"version = {table['version']!r}" if "version" in table else "version: missing"
-        raise ConfigError(f"{said}; write version = {VERSION}")
-    design = _table(table, "design")
-    _refuse_unknown(design, OF_DESIGN, "design.")
-    factors = tuple(_factor(each, n) for n, each in enumerate(_tables(table, "vary")))
-    kind = design.get("kind", GRID)
-    if kind not in KINDS:
-        raise ConfigError(f"design.kind = {kind!r}: choose of {', '.join(KINDS)}")
-    found = Campaign(
-        path=path,
-        text=text,
-        name=_text(table.get("name", path.stem), "name"),
-        seeds=_seeds(table.get("seeds", 1)),
-        fixed=_checked(_table(table, "fixed"), "fixed"),
-        kind=kind,
-        samples=_whole(design.get("samples", 0), "design.samples", least=0),
-        seed=_whole(design.get("seed", 1), "design.seed", least=0),
-        second_order=design.get("second_order", False) is True,
-        factors=factors,
-        cases=_cases(_tables(table, "case")),
-    )
-    _check_design(found)
-    _check_settings(found)
-    return found
 
 
 def _check_design(found: Campaign) -> None:
@@ -330,30 +345,25 @@ def _check_configuration(found: Campaign) -> None:
             raise ConfigError(f"{name}: the configuration refuses it: {refused[0]}")
 
 
-def _factor(entry: Mapping[str, Any], number: int) -> Factor:
-    where = f"vary[{number}]"
-    _refuse_unknown(entry, OF_FACTOR, f"{where}.")
-    name = _text(entry.get("set"), f"{where}.set")
+def _factor(entry: _Vary, number: int) -> Factor:
+    where, name = f"vary[{number}]", entry.set
     check_name(name)
-    if ("values" in entry) == ("low" in entry or "high" in entry):
+    ends = [end for end in (entry.low, entry.high) if end is not None]
+    if len(ends) != (2 if entry.values is None else 0):
         raise ConfigError(f"{where} ({name}): give values, or low and high")
-    if "values" in entry:
-        values = entry["values"]
-        if not isinstance(values, list) or not values:
-            raise ConfigError(f"{where}.values = {values!r}: write a list of values")
-        checked = tuple(check_value(name, value) for value in values)
+    if entry.values is not None:
+        checked = tuple(check_value(name, value) for value in entry.values)
         if len({str(value) for value in checked}) < len(checked):
             raise ConfigError(f"{where}.values: one of them stands there twice")
         return Factor(name, values=checked)
-    low, high = (_number(entry.get(end), f"{where}.{end}") for end in ("low", "high"))
+    low, high = ends
     if not low < high:
         raise ConfigError(f"{where}: low = {low:g} must be below high = {high:g}")
     for end in (low, high):
         check_value(name, end)
-    if "steps" in entry:
-        steps = _whole(entry["steps"], f"{where}.steps", least=2)
+    if entry.steps is not None:
         # As they are written: 0.12, not 0.12000000000000001.
-        evenly = (float(f"{value:.12g}") for value in np.linspace(low, high, steps).tolist())
+        evenly = (float(f"{value:.12g}") for value in np.linspace(low, high, entry.steps).tolist())
         return Factor(name, values=tuple(evenly))
     return Factor(name, low=low, high=high)
 
@@ -362,14 +372,16 @@ def _cases(entries: Sequence[Mapping[str, Any]]) -> tuple[tuple[str, Mapping[str
     found: list[tuple[str, Mapping[str, Value]]] = []
     for number, entry in enumerate(entries):
         settings = dict(entry)
-        name = _text(settings.pop("name", f"case {number + 1}"), f"case[{number}].name")
+        name = settings.pop("name", f"case {number + 1}")
+        if not isinstance(name, str) or not name:
+            raise ConfigError(f"case[{number}].name = {name!r}: write text")
         if any(name == other for other, _ in found):
             raise ConfigError(f"case[{number}].name = '{name}': another case has this name")
-        found.append((name, _checked(settings, f"case[{number}]")))
+        found.append((name, _settings(settings, f"case[{number}]")))
     return tuple(found) or (("", {}),)
 
 
-def _checked(table: Mapping[str, Any], where: str) -> dict[str, Value]:
+def _settings(table: Mapping[str, Any], where: str) -> dict[str, Value]:
     found = {}
     for name, value in _flat(table):
         try:
@@ -394,58 +406,11 @@ def _flat(table: Mapping[str, Any], start: str = "") -> Iterator[tuple[str, Any]
 
 
 def _seeds(given: object) -> tuple[int, ...]:
-    if isinstance(given, dict):
-        _refuse_unknown(given, ("first", "count"), "seeds.")
-        first = _whole(given.get("first", 1), "seeds.first", least=0)
-        return tuple(range(first, first + _seed_count(given.get("count"), "seeds.count")))
     if isinstance(given, list) and given:
-        seeds = tuple(_whole(each, "seeds", least=0) for each in given)
-        if len(set(seeds)) == len(seeds):
-            return seeds
-        raise ConfigError("seeds: one of them stands there twice")
-    return tuple(range(1, 1 + _seed_count(given, "seeds")))
-
-
-def _seed_count(given: object, where: str) -> int:
-    count = _whole(given, where, least=1)
-    if count > FLIGHTS_MAX:
-        raise ConfigError(f"{where} = {count}: more than {FLIGHTS_MAX:,} flights; take fewer seeds")
-    return count
-
-
-def _refuse_unknown(table: Mapping[str, Any], known: Sequence[str], start: str) -> None:
-    for key in table:
-        if key not in known:
-            raise ConfigError(f"{start}{key}: unknown key; choose of {', '.join(known)}")
-
-
-def _table(table: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    found = table.get(key, {})
-    if not isinstance(found, dict):
-        raise ConfigError(f"{key}: write a table: [{key}]")
-    return found
-
-
-def _tables(table: Mapping[str, Any], key: str) -> list[Mapping[str, Any]]:
-    found = table.get(key, [])
-    if not isinstance(found, list) or not all(isinstance(each, dict) for each in found):
-        raise ConfigError(f"{key}: write tables: [[{key}]]")
-    return found
-
-
-def _text(value: object, where: str) -> str:
-    if not isinstance(value, str) or not value:
-        raise ConfigError(f"{where} = {value!r}: write text")
-    return value
-
-
-def _whole(value: object, where: str, *, least: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not value >= least:
-        raise ConfigError(f"{where} = {value!r}: write a whole number, {least} or more")
-    return value
-
-
-def _number(value: object, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ConfigError(f"{where} = {value!r}: write a number")
-    return float(value)
+        if not all(type(each) is int and each >= 0 for each in given):
+            raise ConfigError(f"seeds = {given!r}: write whole numbers, 0 or more")
+        if len(set(given)) < len(given):
+            raise ConfigError("seeds: one of them stands there twice")
+        return tuple(given)
+    found = _Seeds.checked(given if isinstance(given, dict) else {"count": given}, "seeds")
+    return tuple(range(found.first, found.first + found.count))

@@ -291,7 +291,9 @@ def test_a_scenario_that_is_not_there_is_named_with_its_option(
 def test_an_unknown_kind_of_fault_is_refused_with_the_known_ones(
     options: FlyOptions, tmp_path: Path
 ) -> None:
-    with pytest.raises(ConfigError, match="'gremlins': unknown; known kinds: ack-lost, ack-late"):
+    with pytest.raises(
+        ConfigError, match='"gremlins": not known; write one of "ack-lost", "ack-late"'
+    ):
         prepare(replace(options, scenario=scenario(tmp_path, "gremlins")))
 
 
