@@ -27,6 +27,10 @@ ALLOWED = {
         "companion/web/entrance.py",
         "missions/web/office.py",
         "analysis/web/flights.py",
+        "sitl/scenario_file.py",
+        "sitl/stub/faults.py",
+        "sitl/stub/sprayer.py",
+        "sitl/campaign/design.py",
     ),
     "shapefile": ("missions/maps", "analysis/exports/", "analysis/trial_cli.py"),
 }
