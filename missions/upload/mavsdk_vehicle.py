@@ -31,12 +31,23 @@ SET_MESSAGE_INTERVAL, MISSION_CURRENT, CURRENT_EVERY_US = 511, 42, 500_000.0
 ASK_EVERY = 5
 REQUESTS = ("MISSION_REQUEST_INT", "MISSION_REQUEST")
 # Not the vehicle's will but the way there: another attempt may go through.
-PASSING = ("TIMEOUT", "BUSY", "TRANSFER_CANCELLED", "PROTOCOL_ERROR", "INVALID_SEQUENCE", "ERROR")
+PASSING = {
+    "TIMEOUT": "the vehicle did not answer in time",
+    "BUSY": "another transfer is under way",
+    "TRANSFER_CANCELLED": "the vehicle cancelled it",
+    "PROTOCOL_ERROR": "an answer did not fit",
+    "INVALID_SEQUENCE": "items came twice or out of order, as over two radios or routers",
+    "ERROR": "the vehicle gives no reason; another ground station may be uploading",
+}
 REASONS = {
     "TOO_MANY_MISSION_ITEMS": "it has no room for {count} items; upload one sortie at a time",
     "UNSUPPORTED": "it rejects an item of it, or any {what} at all",
     "DENIED": "another ground station is uploading, or its configuration forbids it",
     "INVALID_ARGUMENT": "an item has a parameter that it rejects",
+    "NO_SYSTEM": "it is no longer there",
+    "INT_MESSAGES_NOT_SUPPORTED": "its firmware is too old for places in whole numbers",
+    "MISSION_TYPE_NOT_CONSISTENT": "items are of several kinds",
+    "CURRENT_INVALID": "its first item is not the one to begin with",
 }
 
 
@@ -261,7 +272,7 @@ class MavsdkVehicle:
         except MissionRawError as error:
             if error.result.name == "NO_MISSION_AVAILABLE":
                 return ()
-            raise NotNowError(f"it could not be read back ({error.result.name})") from error
+            raise NotNowError(f"it could not be read back: {_words(error)}") from error
         return tuple(_item(each) for each in found)
 
     async def begin(self) -> None:
@@ -271,14 +282,20 @@ class MavsdkVehicle:
         try:
             await self._raw.set_current_mission_item(0)
         except MissionRawError as error:
-            raise NotNowError(f"the first item does not count ({error.result.name})") from error
+            raise NotNowError(f"the first item does not count: {_words(error)}") from error
+
+
+def _words(error: Any) -> str:
+    """Return a result of MAVSDK in words."""
+    name = error.result.name
+    return PASSING.get(name) or REASONS.get(name, f"MAVSDK says {name}")
 
 
 def _reason(name: str, what: What, count: int, *, asked: int | None = None) -> Exception:
     """Return the error for a result of MAVSDK."""
     if name in PASSING:
-        return NotNowError(f"the transfer broke off ({name})")
-    reason = REASONS.get(name, name.lower()).format(count=count, what=what)
+        return NotNowError(f"the transfer broke off: {PASSING[name]}")
+    reason = REASONS.get(name, f"MAVSDK says {name}").format(count=count, what=what)
     more = "; --no-fence uploads the mission alone" if what == "fence" else ""
     if name == "UNSUPPORTED" and asked is not None:
         reason = "it does not take this item"

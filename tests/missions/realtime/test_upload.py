@@ -189,6 +189,16 @@ async def test_a_mission_with_too_many_items_is_refused_by_the_vehicle(tmp_path:
             await upload(file, url)
 
 
+async def test_every_result_of_mavsdk_has_words() -> None:
+    from mavsdk.plugins.mission_raw import MissionRawResult
+
+    from missions.upload.mavsdk_vehicle import PASSING, REASONS
+
+    of_plans = {each.name for each in MissionRawResult if "PLAN" in each.name}
+    untold = {"UNKNOWN", "SUCCESS", "NEXT", "NO_MISSION_AVAILABLE"} | of_plans
+    assert {each.name for each in MissionRawResult} - untold == {*PASSING, *REASONS}
+
+
 async def typed(*words: str) -> tuple[int, str, str]:
     """Run `vrspray upload` in a process of its own."""
     pipe = asyncio.subprocess.PIPE
