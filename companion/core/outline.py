@@ -26,13 +26,13 @@ _BITE = 5_000
 _SIMPLE_MAX = 1_000
 
 
-def dissolved(parts: Objects) -> Geometry:
+def dissolved(parts: Objects, *, tried: bool = False) -> Geometry:
     """Return the ground of all single, valid polygons (in metres) together.
 
     Corners may move by a millimetre onto the edge of a neighbour. Polygons that overlap by more
-    are joined to the others by an overlay.
+    are joined to the others by an overlay. `tried`: `without_overlay` could not join them.
     """
-    found = without_overlay(parts)
+    found = None if tried else without_overlay(parts)
     if found is not None:
         return found[0]
     inner = shrunk(parts)

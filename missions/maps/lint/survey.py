@@ -124,7 +124,7 @@ class Survey:
         """Return the ground of all zones, those without a rate included."""
         if self.rated.all() and self.rated_joined is not None:
             return self.rated_joined[0]
-        return dissolved(shapely.get_parts(self.local))
+        return dissolved(shapely.get_parts(self.local), tried=bool(self.rated.all()))
 
     @cached_property
     def rated_joined(self) -> tuple[Geometry, float] | None:
@@ -139,7 +139,7 @@ class Survey:
         return (
             self.covered
             if self.rated.all()
-            else dissolved(shapely.get_parts(self.local[self.rated]))
+            else dissolved(shapely.get_parts(self.local[self.rated]), tried=True)
         )
 
     @cached_property

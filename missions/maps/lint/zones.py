@@ -51,7 +51,7 @@ def overlap_problems(survey: Survey, policy: str) -> list[Problem]:
     if joined is not None and joined[1] <= OVERLAP_MAX_M2:
         return []
     rated = np.flatnonzero(survey.rated).tolist()
-    found = overlaps([survey.local[index] for index in rated])
+    found = overlaps([survey.local[index] for index in rated], tried=True)
     if not found:
         return []
 
