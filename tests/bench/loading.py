@@ -119,6 +119,93 @@ def raster(*, seed: int, side: int = 1000, repeats: int = 3) -> list[Figure]:
     ]
 
 
+_CHECK = """
+import contextlib, io, json, sys
+from pathlib import Path
+from time import process_time
+from companion.cli.app import execute
+said = io.StringIO()
+with contextlib.redirect_stdout(said):
+    code = execute(["map", "check", sys.argv[1], "--unit", "L/ha", "--json"])
+status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+peak_mb = int(status["VmHWM"].split()[0]) / 1024
+print(json.dumps([process_time(), peak_mb, code, json.loads(said.getvalue())["zones"]]))
+"""
+
+
+def ragged(*, seed: int, side: int = 150, repeats: int = 3) -> list[Figure]:
+    """Measure `map check` of polygons whose borders are ragged, by processor time.
+
+    Once neighbours have one border, and once each polygon is simplified by itself, as programs do
+    that draw zones from a raster: then they part and overlap by centimetres.
+    """
+    found = []
+    with tempfile.TemporaryDirectory() as folder:
+        zones = ragged_zones(side, np.random.default_rng(seed))
+        apart = shapely.simplify(zones, 0.25)
+        for key, what, areas in (
+            ("check_ragged", "with one border between neighbours", zones),
+            ("check_ragged_apart", "each simplified by itself", apart[shapely.is_valid(apart)]),
+        ):
+            path = Path(folder) / f"{key}.shp"
+            rates = np.random.default_rng(seed).integers(10, 30, len(areas)).astype(float)
+            pyogrio.raw.write(
+                path, geometry=shapely.to_wkb(areas), field_data=[rates], fields=["rate"],
+                geometry_type="Polygon", crs="EPSG:32650",
+            )  # fmt: skip
+            runs = []
+            for _ in range(repeats):
+                done = subprocess.run(
+                    [sys.executable, "-c", _CHECK, str(path)], check=True, capture_output=True
+                )
+                cpu_s, peak_mb, code, count = json.loads(done.stdout)
+                if code == 2 or count != len(areas):
+                    raise ValueError(f"{count} zones were read, not {len(areas)}")
+                runs.append((cpu_s, peak_mb))
+            text = f"map check of {len(areas)} ragged polygons, {what}"
+            cpu_s, peak_mb = (float(np.median(each)) for each in zip(*runs, strict=True))
+            found.append(
+                Figure(
+                    key=key, what=f"{text}: processor time, start and all", value=cpu_s, unit="s",
+                    n=repeats, target=1.0, details={"worst": max(one for one, _ in runs)},
+                )
+            )  # fmt: skip
+            found.append(
+                Figure(
+                    key=f"{key}_memory", what=f"{text}: peak memory of the whole process",
+                    value=peak_mb, unit="MB", n=repeats, target=200.0,
+                )
+            )  # fmt: skip
+    return found
+
+
+def ragged_zones(side: int, rng: np.random.Generator, *, cuts: int = 6) -> np.ndarray:
+    """Return cells of 10 m in UTM whose borders are broken lines, the same for both neighbours."""
+    east, north = np.meshgrid(np.arange(side + 1) * 10.0, np.arange(side + 1) * 10.0)
+    nodes = np.stack([east + 455_000.0, north + 3_984_000.0], axis=-1)
+    nodes += rng.uniform(-1.5, 1.5, nodes.shape)
+    share = np.linspace(0.0, 1.0, cuts + 2)[:-1, None]
+
+    def border(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        line = start[..., None, :] + (end - start)[..., None, :] * share
+        line[..., 1:, :] += rng.uniform(-0.4, 0.4, line[..., 1:, :].shape)
+        return line
+
+    along, up = border(nodes[:, :-1], nodes[:, 1:]), border(nodes[:-1], nodes[1:])
+
+    def back(line: np.ndarray, end: np.ndarray) -> np.ndarray:
+        return np.concatenate([end[..., None, :], line[..., :0:-1, :]], axis=-2)
+
+    rings = np.concatenate(
+        [along[:-1], up[:, 1:], back(along[1:], nodes[1:, 1:]), back(up[:, :-1], nodes[1:, :-1])],
+        axis=2,
+    )
+    zones: np.ndarray = shapely.polygons(rings.reshape(side * side, -1, 2))
+    if not shapely.is_valid(zones).all():
+        raise ValueError("borders cross themselves")
+    return zones
+
+
 def _write(path: Path, side: int, seed: int) -> None:
     zones = grid_zones(side, side, seed=seed)
     with shapefile.Writer(path, shapeType=shapefile.POLYGON) as writer:

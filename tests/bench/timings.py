@@ -8,7 +8,7 @@ from dataclasses import replace
 from tests.bench.arrival import arrivals
 from tests.bench.figures import Figure
 from tests.bench.gpio_edges import gpio_edges
-from tests.bench.loading import loading, raster
+from tests.bench.loading import loading, ragged, raster
 from tests.bench.lookup import cell_lookup, lookup_growth, lookups
 from tests.bench.realtime import times_real_time
 from tests.bench.steps import growth, large_field, small_field
@@ -35,6 +35,7 @@ def map_times(*, seed: int, is_quick: bool) -> list[Figure]:
     figures.append(cell_lookup(seed=seed))
     figures.append(times_real_time(seed=seed, repeats=2 if is_quick else 4))
     figures.append(loading(seed=seed, repeats=1 if is_quick else 3))
+    figures += ragged(seed=seed, repeats=1 if is_quick else 3)
     return _rows(figures + raster(seed=seed, repeats=1 if is_quick else 3))
 
 

@@ -44,7 +44,7 @@ from tests.bench.flights import (
 from tests.bench.identification_figures import Compared
 from tests.bench.identification_figures import figures as identification_figures
 from tests.bench.identified import unknown_tasks
-from tests.bench.loading import loading
+from tests.bench.loading import loading, ragged
 from tests.bench.lookup import linear_scan, lookups
 from tests.bench.parts import Options, Part, chosen
 from tests.bench.report import page
@@ -238,6 +238,10 @@ def test_every_map_has_its_lookups_beside_the_linear_scan() -> None:
 
 def test_the_map_that_is_loaded_is_the_map_that_was_written() -> None:
     assert loading(seed=1, side=3, repeats=1).n == 1
+    figures = by_key(ragged(seed=1, side=3, repeats=1))
+    assert figures.keys() == {
+        f"check_ragged{each}" for each in ("", "_memory", "_apart", "_apart_memory")
+    }
 
 
 @pytest.mark.sitl
