@@ -106,6 +106,8 @@ def map_of(
     """Return the map that a file holds, or refuse what is ambiguous in it."""
     if isinstance(found, Grid):
         return _map_of_grid(found, path, rate_field=rate_field, crs=crs, given=given)
+    if found.rateless is not None:
+        raise found.rateless
     used_crs, crs_problems = crs_of(found, path, crs)
     _polygons(found, path)
     if not found.columns:
@@ -123,10 +125,12 @@ def map_of(
     names = zone_names(found)
     rates = _rates(choice.column, unit, names, path)
     ground, repairs = ground_of(found, used_crs, names, path)
-    zones = tuple(
-        MapZone(name=name, geometry=area, rate_l_ha=rate)
-        for name, area, rate in zip(names, ground, rates, strict=True)
-        if area is not None
+    zones, repeated = _once(
+        [
+            MapZone(name=name, geometry=area, rate_l_ha=rate)
+            for name, area, rate in zip(names, ground, rates, strict=True)
+            if area is not None
+        ]
     )
     return MapFile(
         path=path,
@@ -145,8 +149,35 @@ def map_of(
             *unit.problems,
             *skip_problems(found, names),
             *repair_problems(repairs),
+            *repeated,
         ),
     )
+
+
+def _once(zones: list[MapZone]) -> tuple[tuple[MapZone, ...], list[Problem]]:
+    """Return the zones without those drawn a second time with the same rate, and which they are."""
+    shapes = np.array([zone.geometry for zone in zones], dtype=object)
+    rates = [-1.0 if zone.rate_l_ha is None else zone.rate_l_ha for zone in zones]
+    rows = np.column_stack([shapely.bounds(shapes), rates])
+    _, first, row = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    if len(first) == len(zones):
+        return tuple(zones), []
+    before = first[row.ravel()]
+    again = np.flatnonzero(before != np.arange(len(zones)))
+    one, two = (shapely.normalize(shapes[some]) for some in (again, before[again]))
+    twice = again[shapely.equals_exact(one, two)].tolist()
+    if not twice:
+        return tuple(zones), []
+    problem = Problem(
+        severity="warning",
+        code="repeated-zone",
+        text=f"{len(twice)} of {len(zones)} zones are drawn once more with the same rate, and "
+        "counted once",
+        where=", ".join(zones[index].name for index in twice[:5]),
+        fix="delete them where the map is made",
+    )
+    left = set(twice)
+    return tuple(zone for index, zone in enumerate(zones) if index not in left), [problem]
 
 
 def _map_of_grid(

@@ -61,7 +61,7 @@ def build_prescription(
     Zones without a rate are left out; under `error` zones that share more than a square metre are
     refused.
     """
-    policy = _policy(map_file, overlap)
+    policy = _policy(map_file, map_file.rule(overlap))
     offset_m = (offset_east_m, offset_north_m)
     if not np.isfinite(offset_m).all():
         raise ValueError(f"offset is not a distance: {offset_m}")

@@ -103,7 +103,7 @@ class MapFile:
 
     It holds either `zones` or `cells`. `boundary`, in longitude and latitude, is the outline of
     the field where the file has one; `default_rate_l_ha` is what the file prescribes inside it
-    where there is no zone.
+    where there is no zone, `overlap` the rule that a flight map was compiled with.
     """
 
     path: Path
@@ -117,6 +117,11 @@ class MapFile:
     boundary: MultiPolygon | None = None
     default_rate_l_ha: float | None = None
     problems: tuple[Problem, ...] = ()
+    overlap: str | None = None
+
+    def rule(self, given: str) -> str:
+        """Return the rule where zones overlap: that of the file if it has one, else that given."""
+        return given if self.overlap is None else self.overlap
 
     def __post_init__(self) -> None:
         if self.cells is not None and self.zones:
@@ -188,7 +193,8 @@ class Layer:
     """The content of one file; None among `geometries` is explained in `skipped`.
 
     `unit`: what the file as a whole declares. `boundary`: the
-    outline of the field, in longitude and latitude, where the file has one. `instead`: what else
+    outline of the field, in longitude and latitude, where the file has one. `rateless`: why a file
+    that has only that has no rates. `instead`: what else
     of the file could be sprayed, as an advice where this cannot. `marks` are the points and lines
     among the records that are left out, by number: trees and power lines of obstacle files.
     """
@@ -204,6 +210,7 @@ class Layer:
     skipped: dict[int, str] = field(default_factory=dict)
     problems: tuple[Problem, ...] = ()
     marks: dict[int, BaseGeometry] = field(default_factory=dict)
+    rateless: MapError | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

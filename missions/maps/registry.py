@@ -484,6 +484,7 @@ def read_compiled(path: Path, factors: Mapping[str, float | None]) -> MapFile:
         cells=cells,
         boundary=MultiPolygon(polygons_of(areas[-1])) if border else None,
         default_rate_l_ha=prescription.default_rate_l_ha,
+        overlap=prescription.overlap,
     )
 
 

@@ -78,7 +78,7 @@ def totals(
     refuses more than slivers, it counts for each. `areas_m2` are those of `inside_m2`, for whoever
     has them already.
     """
-    frame = frame_for(map_file) if frame is None else frame
+    frame, overlap = frame or frame_for(map_file), map_file.rule(overlap)
     if default_rate_l_ha is None and map_file.boundary is not None:
         default_rate_l_ha = map_file.default_rate_l_ha
     ground = Ground.of(map_file.boundary if boundary is None else boundary, exclusions)

@@ -309,16 +309,11 @@ def test_task_data_itself_under_any_name(tmp_path: Path) -> None:
     assert found.bands[0].values.tolist() == [[1.0, 2.0]]
 
 
-def test_nearest_task_data_of_a_folder_is_taken(tmp_path: Path) -> None:
-    write(tmp_path, {"TASKDATA.XML": document(task(*TWO)), "old/TASKDATA.XML": b"broken"})
-    assert isinstance(read_isoxml(tmp_path), Layer)
-
-
 def test_two_task_data_beside_each_other_are_refused(tmp_path: Path) -> None:
     write(tmp_path, {f"{name}/TASKDATA.XML": document(task(*TWO)) for name in "ab"})
     with pytest.raises(MapError) as caught:
         read_isoxml(tmp_path)
-    assert caught.value.code == "several-layers"
+    assert caught.value.code == "several-sets"
 
 
 def test_two_grids_of_one_name_in_different_case_are_refused(tmp_path: Path) -> None:
@@ -460,7 +455,7 @@ def test_real_polygon_zones(samples: Path) -> None:
 
 def test_real_grid_of_undefined_codes(samples: Path) -> None:
     with pytest.raises(MapError) as caught:
-        read_isoxml(samples / "11_isoxml_grid1_dotnet")
+        read_isoxml(samples / "11_isoxml_grid1_dotnet" / "TASKDATA.XML")
     assert caught.value.code == "undefined-code"
     assert "93 of 100 cells" in str(caught.value)
     assert "22, 23" in str(caught.value)

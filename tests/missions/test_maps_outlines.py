@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 from shapely import MultiPolygon, Polygon, affinity, box
 
+from companion.cli.app import execute
 from companion.errors import MapError
+from missions.maps.lint import check_map
 from missions.maps.registry import read_area, read_map
+from missions.maps.totals import totals
 from missions.reading_outline import outline_of, told
 from tests.file_kinds import writers
 from tests.file_kinds.ground import FIELD, HOLED, ISLAND, Ground
@@ -195,3 +198,105 @@ def test_an_empty_prj_is_called_empty(tmp_path: Path) -> None:
     path.with_suffix(".prj").unlink()
     with pytest.raises(MapError, match=r"no \.prj beside it"):
         read_map(path, unit="L/ha")
+
+
+# A field of ISOXML without a task is an outline; a task with one rate and no ground is its field's.
+
+FIELD_ONLY = (
+    f'<PFD A="PFD1" C="north">{polygon(OUTER, 1)}{polygon(INNER, 6)}{polygon(INNER, 10)}</PFD>'
+)
+
+
+def test_a_field_without_a_task_is_an_outline_and_no_map(tmp_path: Path) -> None:
+    path = written(tmp_path, FIELD_ONLY)
+    assert outline_of(path, None, []).area == pytest.approx(OUTER.area - INNER.area)
+    with pytest.raises(MapError, match="none of its 0 tasks has treatment zones"):
+        read_map(path, unit="L/ha")
+
+
+def test_of_several_fields_one_is_chosen(tmp_path: Path) -> None:
+    other = Polygon([(x + 0.01, y) for x, y in OUTER.exterior.coords])
+    path = written(tmp_path, FIELD_ONLY, f'<PFD A="PFD2" C="south">{polygon(other, 1)}</PFD>')
+    with pytest.raises(MapError, match=r"several fields: PFD1 \(north\), PFD2 \(south\)"):
+        read_area(path)
+    assert read_area(path, layer="south").area == pytest.approx(OUTER.area)
+    assert outline_of(path, None, [], {"layer": "PFD2"}).area == pytest.approx(OUTER.area)
+
+
+def test_a_lone_task_with_one_rate_is_for_its_field(tmp_path: Path) -> None:
+    lone = task(zone(1, value(200_000)), more='E="PFD1"')
+    found = read_map(written(tmp_path, FIELD_ONLY, lone))
+    assert found.rates_l_ha == (20.0,)
+    assert found.zones[0].geometry.area == pytest.approx(OUTER.area - INNER.area)
+    assert "rate-of-field" in [problem.code for problem in found.problems]
+
+
+@pytest.mark.parametrize(
+    "inside",
+    [
+        task(zone(1, value(200_000)), zone(2, value(100_000)), more='E="PFD1"'),
+        task(zone(1, value(200_000))),
+        task(zone(1, value(200_000)), more='E="PFD1"') + task(zone(1), own="TSK2"),
+    ],
+    ids=["two rates", "no field", "two tasks"],
+)
+def test_a_rate_without_ground_is_laid_over_nothing_else(tmp_path: Path, inside: str) -> None:
+    with pytest.raises(MapError, match="neither polygons nor a grid"):
+        read_map(written(tmp_path, FIELD_ONLY, inside))
+
+
+def test_two_sets_of_task_data_are_refused_at_any_depth(tmp_path: Path) -> None:
+    written(tmp_path, FIELD_ONLY)
+    deep = tmp_path / "backup" / "TASKDATA"
+    deep.mkdir(parents=True)
+    (deep / "taskdata.xml").write_bytes(document(FIELD_ONLY))
+    for path in (tmp_path, tmp_path / "backup"):
+        if path == tmp_path:
+            with pytest.raises(MapError, match=r"several sets .*backup/TASKDATA/taskdata\.xml"):
+                read_area(path)
+        else:
+            assert read_area(path).area > 0.0
+    assert read_area(tmp_path / "TASKDATA.XML").area > 0.0
+
+
+# A zone drawn twice is one zone, and a flight map is read by the rule that was frozen in it.
+
+
+@every_format
+def test_a_zone_drawn_twice_with_one_rate_is_one(tmp_path: Path, write: writers.Writer) -> None:
+    beside = affinity.translate(FIELD, 60.0)
+    path = write(ground(FIELD, beside, FIELD), tmp_path)
+    found = read_map(path, unit="L/ha")
+    assert len(found.zones) == 2
+    assert totals(found).all_litres == pytest.approx(2 * 7.2, rel=1e-3)
+    assert [problem.code for problem in check_map(found)] == ["repeated-zone"]
+
+
+def test_a_zone_drawn_twice_with_two_rates_still_overlaps(tmp_path: Path) -> None:
+    made = Ground(polygons=(FIELD, FIELD), columns={"rate": [20.0, 26.0]})
+    found = read_map(writers.geojson_by_hand(made, tmp_path), unit="L/ha")
+    assert [problem.code for problem in check_map(found)] == ["overlap"]
+
+
+def test_a_flight_map_is_read_by_its_own_rule_of_overlaps(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    over = affinity.translate(FIELD, 30.0)
+    made = Ground(polygons=(FIELD, over), columns={"rate": [20.0, 30.0], "unit": ["L/ha"] * 2})
+    source = writers.geojson_by_hand(made, tmp_path)
+    path = tmp_path / "f.flightmap.gpkg"
+    compiled = ["map", "compile", str(source), "--overlap", "max", "--out", str(path)]
+    assert execute(compiled) == 0
+    capsys.readouterr()
+
+    def asked(*arguments: str) -> dict[str, object]:
+        assert execute(["map", *arguments, "--json"]) == 0
+        found: dict[str, object] = json.loads(capsys.readouterr().out)
+        return found
+
+    litres = pytest.approx(0.18 * 20.0 + 0.36 * 30.0, rel=1e-3)
+    assert asked("check", str(path))["litres"] == litres
+    assert asked("show", str(path), "--out", str(tmp_path / "m.png"))["litres"] == litres
+    assert asked("rate", str(path), "48.0002", "11.0006")["rate_l_ha"] == 30.0
+    assert execute(["map", "check", str(path), "--overlap", "min"]) == 2
+    assert "it was compiled with the rule max" in capsys.readouterr().err

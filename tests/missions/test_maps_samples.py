@@ -87,7 +87,8 @@ def test_a_usable_set_has_its_measured_facts(
         ("03_shp_value_noUnit", (), "no-unit"),
         ("08_isoxml_v4_tzn_vector_map1", (), "not-a-volume"),
         ("10_geojson/app_map_vector.geojson", (), "no-unit"),
-        ("11_isoxml_grid1_dotnet", (), "undefined-code"),
+        ("11_isoxml_grid1_dotnet", (), "several-sets"),
+        ("11_isoxml_grid1_dotnet/TASKDATA.XML", (), "undefined-code"),
         ("11_isoxml_grid1_dotnet/invalid", (), "binary-length"),
         # Its presentation shows ten times what the definition of DDI 6 says.
         ("12_isoxml_grid2_dotnet", WEIGHT, "unit-conflict"),

@@ -22,6 +22,8 @@ from missions.maps.cli.options import File, Reading, reading_options
 from missions.maps.convert.cell_zones import outline_of_rates
 from missions.maps.convert.compare import CHANGE_MAX_L_HA, Comparison, compare
 from missions.maps.convert.formats import Wish, keeps_cells, keeps_raster, write_map, writer_for
+from missions.maps.lint.survey import Survey
+from missions.maps.lint.zones import overlap_problems
 from missions.maps.local import polygons_of
 from missions.maps.model import MapFile, Problem, map_error
 from missions.maps.registry import read_map
@@ -92,14 +94,14 @@ def convert(
     if overlap is not None and overlap not in _OVERLAPS:
         raise typer.BadParameter(f"--overlap is one of {', '.join(_OVERLAPS)}, not {overlap!r}")
     writer = writer_for(out, format_name)
-    source = reading.read(file)
+    source = reading.with_overlap(overlap).read(file)
     if round_l_ha is not None:
         source = _rounded(source, round_l_ha)
     wish = Wish(
         cell_m=cell_m,
         flow_width_m=_flow(reading, "flow_width_m"),
         flow_speed_m_s=_flow(reading, "flow_speed_m_s"),
-        overlap=overlap or reading.overlap,
+        overlap=overlap or source.rule(reading.overlap),
     )
     checked: list[_Checked] = []
     try:
@@ -214,6 +216,10 @@ def _result(
     written = checked.written
     after, before = totals(written), totals(source)
     problems = list(source.problems)
+    # Formats of zones keep them; who reads the file must have a rule for them.
+    if source.overlap is None and format_name not in _OF_CELLS:
+        shared = overlap_problems(Survey(source), "error")
+        problems += [replace(found, severity="warning") for found in shared]
     lost_ha, beyond_ha = _at_edges(source, written, after.area_ha, before.area_ha)
     if format_name in _OF_CELLS:
         problems += _area_problems(out, after.area_ha, before.area_ha, (lost_ha, beyond_ha))

@@ -21,7 +21,7 @@ from missions.maps.cli.new import parse_place
 from missions.maps.lint import Plan, Sprayer
 from missions.maps.lint.survey import Survey
 from missions.maps.local import frame_around, grown
-from missions.maps.model import MapFile, Problem
+from missions.maps.model import MapFile, Problem, map_error
 from missions.maps.registry import read_area, read_map, read_records
 
 File = Annotated[Path, typer.Argument(metavar="FILE", help="Prescription map.")]
@@ -131,7 +131,8 @@ class Reading:
         if self.config is None or table is None:
             return replace(self, policy=policy)
         changed = table.model_copy(update={"overlap": policy})
-        return replace(self, config=self.config.model_copy(update={"prescription": changed}))
+        config = self.config.model_copy(update={"prescription": changed})
+        return replace(self, config=config, policy=policy)
 
     @property
     def answers(self) -> dict[str, Any]:
@@ -156,7 +157,15 @@ class Reading:
             if given is None and table is not None and (own or name not in _OF_ONE_FILE):
                 given = getattr(table, name)
             answers[name] = given
-        return read_map(file, **answers)
+        found = read_map(file, **answers)
+        if self.policy is not None and found.rule(self.policy) != self.policy:
+            raise map_error(
+                file,
+                f"it was compiled with the rule {found.overlap} where zones overlap",
+                fix="leave out --overlap, or compile its source again",
+                code="frozen-overlap",
+            )
+        return found
 
     def _is_own(self, file: Path, table: PrescriptionTable) -> bool:
         if self.config is None:

@@ -14,7 +14,7 @@ from shapely import MultiPolygon, Polygon, box
 from shapely.errors import ShapelyError
 
 from missions.maps.crs import WGS84
-from missions.maps.isoxml.task import ById, Task
+from missions.maps.isoxml.task import ById
 from missions.maps.isoxml.values import EXPORT_AGAIN, children, integer, number, required, text
 from missions.maps.local import Area, as_area, polygons_of
 from missions.maps.model import Affine, Problem, check_coordinates, check_counts, map_error
@@ -28,33 +28,35 @@ _OUTSIDE_MAX = 0.05
 _TRIED_MAX = 50_000
 
 
-def field_of(root: Element, task: Task, path: Path) -> tuple[MultiPolygon | None, list[Problem]]:
-    """Return the outline of the field that the task names, in longitude and latitude."""
-    if task.field is None:
+def field_of(
+    root: Element, own: str | None, path: Path
+) -> tuple[MultiPolygon | None, list[Problem]]:
+    """Return the outline of the field of this id, in longitude and latitude."""
+    if own is None:
         return None, []
-    field = ById(root, "PFD", path).get(task.field)
+    field = ById(root, "PFD", path).get(own)
     if field is None:
         problem = Problem(
             severity="warning",
             code="undefined-code",
-            text=f"the task is for the field {task.field[:40]}, which the file does not have; "
+            text=f"the task is for the field {own[:40]}, which the file does not have; "
             "the map has no outline",
-            where=task.id,
+            where=own,
             fix=EXPORT_AGAIN,
         )
         return None, [problem]
     polygons = children(field, "PLN")
     check_counts(path, records=len(polygons), vertices=point_count(polygons))
-    ground, others = ground_of_polygons(polygons, (FIELD,), where=f"field {task.field}", path=path)
+    ground, others = ground_of_polygons(polygons, (FIELD,), where=f"field {own}", path=path)
     blocked, rest = ground_of_polygons(
-        polygons, OBSTACLES, where=f"field {task.field}", path=path, nested=True
+        polygons, OBSTACLES, where=f"field {own}", path=path, nested=True
     )
     objects = others - (len(polygons) - rest)
     outline = outline_of([ground], WGS84, path)
     problems = []
     if outline is not None and blocked is not None:
         outline, taken = _without(outline, blocked, path)
-        problems.append(_field_objects(task.field, taken))
+        problems.append(_field_objects(own, taken))
     if objects:
         problems.append(
             Problem(
@@ -62,7 +64,7 @@ def field_of(root: Element, task: Task, path: Path) -> tuple[MultiPolygon | None
                 code="field-objects",
                 text=f"the field has {objects} other polygons (headland, buffer zones), which are "
                 "not taken out of the map",
-                where=task.field,
+                where=own,
                 fix="give what must not be sprayed as an exclusion (prescription.exclusions)",
             )
         )

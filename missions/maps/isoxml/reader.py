@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from shapely import MultiPolygon, Polygon
 from shapely.errors import ShapelyError
 
+from companion.errors import MapError
 from missions.maps.bundle import MAX_ELEMENTS, Bundle, open_bundle, parse_xml
 from missions.maps.crs import WGS84
 from missions.maps.isoxml.field import (
@@ -43,7 +44,13 @@ from missions.maps.isoxml.rates import (
     shown_in_zones,
     special_problems,
 )
-from missions.maps.isoxml.task import Task, TreatmentZone, chosen_task, instead_of
+from missions.maps.isoxml.task import (
+    Task,
+    TreatmentZone,
+    chosen_task,
+    instead_of,
+    spread_over_field,
+)
 from missions.maps.isoxml.values import EXPORT_AGAIN, children, integer, required, tag, text
 from missions.maps.local import as_area, polygons_of
 from missions.maps.model import (
@@ -61,6 +68,7 @@ from missions.maps.model import (
 # ------------------------------------------------------------------------------ the files of a task
 
 _TASK_DATA = "TASKDATA.XML"
+_SETS_MAX = 8
 # "TSK00001", "GRD00001": ISO 11783-10 wants three letters and five digits.
 _FILE_NAME = re.compile(r"[A-Za-z0-9_-]{1,32}")
 _KNOWN_VERSIONS = ("3", "4")
@@ -183,7 +191,7 @@ def _bundle(path: Path) -> Bundle:
 
 
 def _main_name(bundle: Bundle, path: Path) -> str:
-    """Return the name of the task data; of several in a folder, the one nearest to it."""
+    """Return the name of the task data; several in a package may be of different fields."""
     if path.name in bundle.files and path.suffix.casefold() == ".xml":
         return path.name
     found = bundle.called(_TASK_DATA)
@@ -194,20 +202,14 @@ def _main_name(bundle: Bundle, path: Path) -> str:
             fix=f"name the folder or the zip that holds {_TASK_DATA}",
             code="no-file",
         )
-    depth = min(map(_depth, found))
-    nearest = [name for name in found if _depth(name) == depth]
-    if len(nearest) > 1:
+    if len(found) > 1:
         raise map_error(
             path,
-            f"there are several sets of task data: {', '.join(nearest)}",
-            fix=f"name one of the {_TASK_DATA}, or keep one",
-            code="several-layers",
+            f"there are several sets of task data: {', '.join(found[:_SETS_MAX])}",
+            fix=f"unpack it, and name one {_TASK_DATA} or its folder",
+            code="several-sets",
         )
-    return nearest[0]
-
-
-def _depth(name: str) -> int:
-    return len(PurePosixPath(name).parts)
+    return found[0]
 
 
 def _check_root(root: Element, path: Path) -> list[Problem]:
@@ -249,16 +251,56 @@ def read_isoxml(path: Path, layer: str | None = None) -> Layer | Grid:
     `layer` is the id or the designator of one of several tasks.
     """
     files = TaskFiles(path)
-    task, tasks = chosen_task(files.root, path, layer, product_names(files.root))
+    spread_problems = spread_over_field(files.root)
+    try:
+        task, tasks = chosen_task(files.root, path, layer, product_names(files.root))
+    except MapError as error:
+        if error.code != "no-rate-column":
+            raise
+        return _of_field(files, layer, error)
     instead = instead_of(task.id, tasks)
     references = References(files.root, path, instead)
-    boundary, problems = field_of(files.root, task, path)
+    boundary, problems = field_of(files.root, task.field, path)
     found: Layer | Grid
     if task.grid is not None:
         found = grid_of_task(files, task.grid, task, references, boundary)
     else:
         found = zones_layer(files, task, references, boundary)
-    return replace(found, instead=instead, problems=(*files.problems, *problems, *found.problems))
+    problems = [*files.problems, *spread_problems, *problems, *found.problems]
+    return replace(found, instead=instead, problems=tuple(problems))
+
+
+def _of_field(files: TaskFiles, layer: str | None, rateless: MapError) -> Layer:
+    """Return the outline of the only field, or of the one that `layer` names.
+
+    Whoever looks for rates in it is told why there are none.
+    """
+    fields = [one for one in children(files.root, "PFD") if children(one, "PLN")]
+    found = [one for one in fields if layer is None or layer in (text(one, "A"), text(one, "C"))]
+    if not fields or (layer is not None and not found):
+        raise rateless
+    if len(found) > 1:
+        listed = ", ".join(f"{text(one, 'A')} ({text(one, 'C')})" for one in found[:_SETS_MAX])
+        raise map_error(
+            files.path,
+            f"no task of it has a prescription, and it has several fields: {listed}",
+            fix="for the outline of one of them, choose it with --layer",
+            code="several-layers",
+        )
+    own = required(found[0], "A", files.path)
+    boundary, problems = field_of(files.root, own, files.path)
+    if boundary is None:
+        raise rateless
+    return Layer(
+        format="isoxml",
+        crs=WGS84,
+        columns=(),
+        geometries=(boundary,),
+        sha256=files.sha256,
+        boundary=boundary,
+        rateless=rateless,
+        problems=(*files.problems, *problems),
+    )
 
 
 # Polygon treatment zones of an ISOXML task, as a layer of records.

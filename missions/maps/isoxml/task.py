@@ -17,7 +17,7 @@ from missions.maps.isoxml.values import (
     tag,
     text,
 )
-from missions.maps.model import check_counts, map_error
+from missions.maps.model import Problem, check_counts, map_error
 from missions.maps.units import rate_unit
 
 # The standard ends at 254; some programs number their polygons beyond.
@@ -148,6 +148,33 @@ def chosen_task(
         raise ValueError("a task that prescribes has its id")
     _check_grid(chosen, tasks, path)
     return _task(chosen, path), every
+
+
+def spread_over_field(root: Element) -> list[Problem]:
+    """Lay the only rate of the only task over its field, where neither has any other ground.
+
+    Without polygons and without a grid a treatment zone holds for all of the task's field.
+    """
+    tasks = children(root, "TSK")
+    zones = [zone for task in tasks for zone in children(task, "TZN")]
+    fields = [
+        one for one in children(root, "PFD") if tasks and text(one, "A") == text(tasks[0], "E")
+    ]
+    ground = [one for field in fields for one in children(field, "PLN")]
+    alone = len(tasks) == len(zones) == len(fields) == 1 and ground
+    if not alone or not children(zones[0], "PDV"):
+        return []
+    if children(zones[0], "PLN") or children(tasks[0], "GRD"):
+        return []
+    zones[0].extend(ground)
+    problem = Problem(
+        severity="warning",
+        code="rate-of-field",
+        text="the task has one rate and no ground of its own; it is taken for the whole field",
+        where=(text(fields[0], "C") or text(fields[0], "A") or "")[:40],
+        fix="nothing, if the field is sprayed at one rate",
+    )
+    return [problem]
 
 
 def _nothing_prescribed(tasks: Sequence[Element], path: Path) -> Exception:

@@ -29,7 +29,7 @@ def check_map(
     Overlaps are an error only where the overlap policy refuses them.
     """
     plan = plan or Plan()
-    return _checked(_survey(map_file, plan), overlap, plan)
+    return _checked(_survey(map_file, plan), map_file.rule(overlap), plan)
 
 
 def summary(
@@ -45,7 +45,7 @@ def summary(
     `totals` has them; `map_area_ha` is the ground of the file's own zones or cells with a rate,
     inside the boundary and outside.
     """
-    plan = plan or Plan()
+    plan, overlap = plan or Plan(), map_file.rule(overlap)
     survey = _survey(map_file, plan)
     problems = _worst_first([*_checked(survey, overlap, plan), *_placed(survey, more)])
     parts = shapely.get_parts(np.array([zone.geometry for zone in map_file.zones], dtype=object))
