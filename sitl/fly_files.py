@@ -229,7 +229,7 @@ def _draw_asked(record: FlightRecord, axes: Axes) -> None:
             )
             colour = colours(np.array(zone.rate_l_ha))
             axes.add_patch(PathPatch(outline, facecolor=colour, edgecolor="white", linewidth=0.3))
-    axes.plot(record.east_m, record.north_m, color="tab:red", linewidth=0.7)
+    axes.plot(record.east_m, record.north_m, color="black", linewidth=0.7)
     _frame(axes, record, "prescribed, and the way flown")
 
 
@@ -292,8 +292,9 @@ def _draw_flow(record: FlightRecord, axes: Axes, name: str) -> None:
     volume_ml = record.volume_ml.sum(axis=1)[::period]
     time_s = record.time_s[::period]
     flow_l_min = np.diff(volume_ml) / np.diff(time_s) * 0.06
-    axes.plot(0.5 * (time_s[1:] + time_s[:-1]), flow_l_min, linewidth=0.7, label=name)
-    axes.set_xlabel("time [s]")
+    middle_s = 0.5 * (time_s[1:] + time_s[:-1]) - record.time_s[0]
+    axes.plot(middle_s, flow_l_min, linewidth=0.7, label=name)
+    axes.set_xlabel("time of the flight [s]")
     axes.set_ylabel("flow [L/min]")
 
 

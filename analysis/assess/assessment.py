@@ -30,10 +30,16 @@ from analysis.dose import flow_samples, misapplied_parts
 from analysis.evaluation import Changes, Distances, Evaluation, changes_of, evaluate_strips
 from analysis.flown.applied_record import STEP_S, Source, modelled_ml, record_of
 from analysis.flown.holes import GAP_S
-from analysis.flown.modelled_flow import metered_l, ordered_s
+from analysis.flown.modelled_flow import meter_within_percent, metered_l, ordered_s
 from analysis.lag import Verdict
 from analysis.strips import Strip, strips_of
-from analysis.student import Interval, crossings_of, mean_interval, ratio_interval
+from analysis.student import (
+    Interval,
+    crossings_of,
+    mean_interval,
+    ratio_interval,
+    t_factor,
+)
 from companion.core.inputs import Fix
 
 if TYPE_CHECKING:
@@ -167,8 +173,8 @@ class Balance:
     """Litres of a flight; None where there is no such sensor, or it said too little.
 
     `prescribed_l` is the integral of the prescription over the ground that was treated, once.
-    Percentages are of what stands second in their name. `meter_spread_percent` is one standard
-    deviation of the meter as the configuration of the fault detection has it.
+    Percentages are of what stands second in their name. Litres by the meter are within
+    `meter_within_percent` of the truth; None where the curves contradict it.
     """
 
     prescribed_l: float
@@ -183,7 +189,7 @@ class Balance:
     meter_to_model_percent: float | None
     tank_to_model_percent: float | None
     tank_to_meter_percent: float | None
-    meter_spread_percent: float | None
+    meter_within_percent: float | None
 
     def as_json(self) -> dict[str, Any]:
         """Return all figures."""
@@ -196,13 +202,11 @@ def balance_of(flight: AppliedFlight, model_ml: float, asked_l: float) -> Balanc
     tank_l = None
     if start_l is not None and end_l is not None and refilled_l is not None:
         tank_l = start_l + refilled_l - end_l
-    detection = flight.setup.detection
     return _balance(
         asked_l,
         model_ml / ML_PER_L,
         metered_l(flight),
         tank_l,
-        None if detection is None else 100.0 * detection.spread,
         (start_l, end_l, refilled_l),
     )
 
@@ -212,7 +216,6 @@ def _balance(
     model_l: float,
     meter_l: float | None,
     tank_l: float | None,
-    spread_percent: float | None,
     levels_l: tuple[float | None, float | None, float | None] = (None, None, None),
 ) -> Balance:
     start_l, end_l, refilled_l = levels_l
@@ -229,7 +232,7 @@ def _balance(
         meter_to_model_percent=_off(meter_l, model_l),
         tank_to_model_percent=_off(tank_l, model_l),
         tank_to_meter_percent=_off(tank_l, meter_l),
-        meter_spread_percent=spread_percent,
+        meter_within_percent=meter_within_percent(meter_l, model_l),
     )
 
 
@@ -399,7 +402,6 @@ def together(parts: Sequence[Assessment], treated: Treated) -> Essentials:
             sum(each.model_l for each in balances),
             _sum(each.meter_l for each in balances),
             _sum(each.tank_l for each in balances),
-            first.balance.meter_spread_percent,
         ),
     )
 
@@ -428,7 +430,7 @@ def assess(
         strips=tuple(strips),
         evaluation=evaluation,
         worst=worst_of(flight, evaluation.steps),
-        intervals=_intervals(evaluation, strips),
+        intervals=_intervals(evaluation, strips, flight.setup.lag),
         breakdowns=breakdowns(evaluation, strips),
         cells=cell_maps(
             record, strips, duties_of(flight, record.time_s), cell_m=cell_m, flown=ground.own
@@ -453,7 +455,9 @@ def duties_of(flight: AppliedFlight, time_s: Floats) -> list[Floats]:
     return found
 
 
-def _intervals(evaluation: Evaluation, strips: Sequence[Strip]) -> dict[str, Interval]:
+def _intervals(
+    evaluation: Evaluation, strips: Sequence[Strip], lag: LagModel
+) -> dict[str, Interval]:
     inside = [step for step in evaluation.steps if not step.change.border]
     lags = [(s.change.time_s, s.lag_distance_m) for s in inside if s.lag_distance_m is not None]
     settled = [
@@ -461,13 +465,17 @@ def _intervals(evaluation: Evaluation, strips: Sequence[Strip]) -> dict[str, Int
         for s in evaluation.settled_steps
         if s.lag_distance_m is not None
     ]
+    shared_m = [uncertainty_m(s, lag) for s in inside if s.lag_distance_m is not None]
+    sd_m = float(np.mean(shared_m)) if shared_m else 0.0
     margins = [(each.time_s, each.margin_m) for each in evaluation.crossings]
     samples = flow_samples(strips)
     ways = ways_between(evaluation, samples.time_s)
     wrong = misapplied_parts(strips)
     return {
-        "lag_distance_m": _of(lags),
-        "lag_distance_abs_m": _no_less_than_0(_of((at_s, abs(lag_m)) for at_s, lag_m in lags)),
+        "lag_distance_m": _shared(_of(lags), sd_m),
+        "lag_distance_abs_m": _no_less_than_0(
+            _shared(_of((at_s, abs(lag_m)) for at_s, lag_m in lags), sd_m)
+        ),
         "settled_lag_distance_m": _of(settled),
         "border_margin_m": _of(margins),
         "spraying_accuracy_percent": mean_interval(samples.accuracy_percent, ways),
@@ -475,6 +483,14 @@ def _intervals(evaluation: Evaluation, strips: Sequence[Strip]) -> dict[str, Int
             100.0 * wrong.wrong_ml, wrong.asked_ml, ways_between(evaluation, wrong.time_s)
         ),
     }
+
+
+def _shared(interval: Interval, sd_m: float) -> Interval:
+    """Return it wider by what no number of changes averages out: position, lags and curves."""
+    if interval.low is None or interval.mean is None:
+        return interval
+    half_m = math.hypot(interval.mean - interval.low, t_factor(1000) * sd_m)
+    return replace(interval, low=interval.mean - half_m, high=interval.mean + half_m)
 
 
 def _no_less_than_0(interval: Interval) -> Interval:

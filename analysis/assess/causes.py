@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from analysis.changes import SPEED_MIN_M_S
+from analysis.flown.holes import UNREAD
 from analysis.flown.modelled_flow import ML_S_PER_L_MIN
 from analysis.holds import CLEAR_M
 from analysis.lag import Verdict
@@ -276,18 +277,26 @@ def in_acceleration(marks: Marks, off: Bools) -> Bools:
 
 
 def by_inhibit(flight: AppliedFlight, marks: Marks, where: Bools) -> dict[str, float]:
-    """Return the ground by the reason that held the valves; of several, by all of them at once."""
+    """Return the ground by the reason that held the valves; of several, by all of them at once.
+
+    A valve that was held takes its lag, and a dose its period, to be back: the reason stays.
+    """
     names = np.array(flight.inhibits, dtype=object)
-    lead_s = flight.setup.lag.off_s + flight.setup.lag.output_s
     found: dict[str, float] = {}
-    reasons = names[samples_at(flight, marks.time_s[where] - lead_s)]
-    later = names[samples_at(flight, marks.time_s[where])]
-    for reason, then, area in zip(
-        reasons.tolist(), later.tolist(), marks.area_m2[where].tolist(), strict=True
-    ):
-        name = reason or then or "a condition that had just ended"
+    looks = [
+        names[samples_at(flight, marks.time_s[where] - back_s)].tolist()
+        for back_s in backs_s(flight.setup.lag)
+    ]
+    for area, *reasons in zip(marks.area_m2[where].tolist(), *looks, strict=True):
+        name = next(filter(None, reasons), UNREAD)
         found[name] = found.get(name, 0.0) + area
     return found
+
+
+def backs_s(lag: LagModel) -> tuple[float, ...]:
+    """Return how long before a dose what kept a valve from it is looked for."""
+    lead_s = lag.off_s + lag.output_s
+    return (lead_s, 0.0, 0.5 * lead_s, lead_s + INHIBIT_TAIL_S)
 
 
 # What the causes of wrong doses are looked for in: one strip, mark by mark.
@@ -329,9 +338,8 @@ class Marks:
         # As `samples_at`: the first sample counts before it, too, and the last one for good.
         edges_s = np.concatenate((flight.time_s, [math.inf]))[edges]
         edges_s[edges == 0] = -math.inf
-        lead_s = flight.setup.lag.off_s + flight.setup.lag.output_s
         found = np.zeros(len(self.time_s), dtype=np.bool_)
-        for back_s in (0.0, 0.5 * lead_s, lead_s, lead_s + INHIBIT_TAIL_S):
+        for back_s in backs_s(flight.setup.lag):
             # Few edges are sought among many marks, not each mark among the samples.
             at = np.searchsorted(self.time_s - back_s, edges_s).tolist()
             for first, end in zip(at[::2], at[1::2], strict=True):

@@ -321,7 +321,11 @@ def _warnings(flight: AppliedFlight) -> list[str]:
 
 def _sentence(result: dict[str, object]) -> str:
     rows = {"points": "points", "swaths": "polygons", "steps": "rows"}[str(result["geometry"])]
-    mark = "" if result["training"] in ("no", "unknown") else f", training: {result['training']}"
+    mark = (
+        ""
+        if result["training"] in ("no", "unknown", "simulated")
+        else f", training: {result['training']}"
+    )
     mark += ", SIMULATED" if result["simulated"] == "yes" else ""
     metered_l = result["metered_l"]
     meter = "" if metered_l is None else f" ({metered_l:.3f} L by the flow meter)"

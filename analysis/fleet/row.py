@@ -83,7 +83,7 @@ COLUMNS = (
     Column("untreated_m2", "number", "of the field with a rate, not treated in this flight"),
     Column("outside_ml", "number", "left the field or fell in an exclusion"),
     Column("changes", "whole number", "changes of rate whose lag was measured"),
-    Column("missed_changes", "whole number", "changes of rate that never came"),
+    Column("missed_changes", "whole number", "changes of rate that never happened"),
     Column("apart_changes", "whole number", "changes of rate that cannot be measured"),
     Column("mean_lag_m", "number", "mean of the absolute lag distances"),
     Column("worst_lag_m", "number", "bound of the worst change (95 %)"),

@@ -87,7 +87,7 @@ FIGURES = (
     Figure("missed_m2", "sum(missed_m2)", "missed m²", 0, "under passes, and left bare"),
     Figure("doubled_m2", "sum(doubled_m2)", "twice m²", 0, "treated twice, in one job"),
     Figure("changes", "sum(changes)", "changes", 0, "changes of rate whose lag was measured"),
-    Figure("missed_changes", "sum(missed_changes)", "missed", 0, "changes that never came"),
+    Figure("missed_changes", "sum(missed_changes)", "missed", 0, "changes that never happened"),
     Figure("apart_changes", "sum(apart_changes)", "apart", 0, "changes that cannot be measured"),
     Figure(
         "mean_lag_m",

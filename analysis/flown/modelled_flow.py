@@ -189,6 +189,29 @@ def counted(series: Series) -> tuple[Floats, Floats]:
     return time_s, np.concatenate(([0.0], np.cumsum(np.where(rises >= 0.0, rises, value[1:]))))
 
 
+# How far a turbine meter, as they are sold, may be off; no journal says that it was weighed.
+METER_PERCENT = 3.0
+# Such a meter and a curve of a few percent may differ by this much and be sound.
+METER_OFF_PERCENT = 6.0
+
+
+def meter_within_percent(meter_l: float | None, model_l: float) -> float | None:
+    """Return how far off the litres of a meter may be; None where the curves contradict it."""
+    if meter_l is None or not abs(meter_l - model_l) <= METER_OFF_PERCENT / 100.0 * model_l:
+        return None
+    return METER_PERCENT
+
+
+def meter_text(meter_l: float, model_l: float) -> str:
+    """Return how sure litres by the meter are, to stand behind its name.
+
+    >>> meter_text(1.02, 1.0), meter_text(0.5, 1.0)
+    (', ±3 %', ', which the curves contradict')
+    """
+    within = meter_within_percent(meter_l, model_l)
+    return ", which the curves contradict" if within is None else f", ±{within:g} %"
+
+
 def metered_l(flight: AppliedFlight) -> float | None:
     """Return what the flow meter counted in all; None without one."""
     if flight.meter_ml is None:

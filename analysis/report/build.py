@@ -98,7 +98,7 @@ class Judged:
 
 def judged(journal: Path, options: ReportOptions, *, say: Say = lambda _: None) -> Judged:
     """Return what the report of one journal says."""
-    say(f"reading {journal.name}")
+    say(f"reading {journal}")
     unread: list[str] = []
     flight = read_applied(journal, unread=unread)
     treated = treated_of(flight)

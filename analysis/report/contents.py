@@ -8,9 +8,13 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+
 from analysis.assess.causes import Cause, rate_wishes
 from analysis.flown.holes import GAP_S, UNREAD
+from analysis.flown.modelled_flow import METER_OFF_PERCENT, meter_text
 from analysis.journals.content import content_sha256
+from analysis.lag import Verdict
 from analysis.published import P1_RESULTS
 from analysis.report.clock import duration_text
 from analysis.report.label import label_of
@@ -243,8 +247,6 @@ LATCHED = frozenset(
         Inhibit.VALVE_STUCK_OPEN, Inhibit.NO_FLOW, Inhibit.TANK_EMPTY, Inhibit.FLOW_FAULT,
     }
 )  # fmt: skip
-# A meter of 3 % and a curve of a few percent may differ by this much and be sound.
-METER_OFF_PERCENT = 6.0
 # More of the ground than this is not flown over closed by the way.
 HELD_SHARE = 0.01
 # Of what a record lacks, so much is named above it.
@@ -284,8 +286,9 @@ def sentence_of(figures: Figures, training: str | None) -> str:
     }
     done = what.get(training or "", "L applied")
     how = "modelled, not metered"
-    if figures.applied_by == "flow meter":
-        how = f"by the flow meter; modelled {figures.modelled_l:.2f} L"
+    if figures.metered_l is not None and figures.modelled_l is not None:
+        sure = meter_text(figures.metered_l, figures.modelled_l)
+        how = f"by the flow meter{sure}; modelled {figures.modelled_l:.2f} L"
     parts = [f"{figures.applied_l:.2f} {done} ({how}) on {figures.area_ha:.2f} ha"]
     if figures.prescribed_l and figures.off_percent is not None:
         parts[0] += (
@@ -316,7 +319,7 @@ WHY_NOT = {
     "saturated": "at the end of the valves' range",
     "border": "held by the border",
     "unknown": "not recorded",
-    "missed": "that never came",
+    "missed": "that never happened",
 }
 
 
@@ -350,7 +353,7 @@ def warnings_of(
         *_wishes(flight, clock),
         *_wind(flight),
         *_receiver(flight),
-        *_flow(assessment, why_not_evaluated),
+        *_flow(assessment, why_not_evaluated, clock),
         *record_warnings(records),
     ]
     order = ("mark", "warning", "note")
@@ -509,7 +512,7 @@ def _faults(texts: Iterable[str]) -> Iterator[Caution]:
         yield _warning("fault", f"Fault in flight: {text}.")
 
 
-def _flow(assessment: Assessment | None, why_not: str) -> Iterator[Caution]:
+def _flow(assessment: Assessment | None, why_not: str, clock: Clock) -> Iterator[Caution]:
     if assessment is None:
         yield _warning("not-evaluated", f"No metric can be computed: {why_not}.")
         return
@@ -522,9 +525,7 @@ def _flow(assessment: Assessment | None, why_not: str) -> Iterator[Caution]:
             "one of them is wrong.",
         )
     if evaluation.missed:
-        changes = "change" if evaluation.missed == 1 else "changes"
-        text = f"{evaluation.missed} {changes} of rate (on and off at borders included)"
-        yield _warning("missed", f"{text} never happened, according to the journal.")
+        yield _warning("missed", _never_happened(assessment, clock))
     if evaluation.off_target_ml > 1.0:
         yield _warning("outside", f"{evaluation.off_target_ml:.1f} mL fell outside the field.")
     if evaluation.off_line_ml > 1.0:
@@ -532,6 +533,26 @@ def _flow(assessment: Assessment | None, why_not: str) -> Iterator[Caution]:
             "off-line",
             f"{evaluation.off_line_ml:.1f} mL fell in the field, beside the planned lines.",
         )
+
+
+def _never_happened(assessment: Assessment, clock: Clock) -> str:
+    """Return what the journal has no change of flow for: how often, which valves, first where."""
+    flight = assessment.flight
+    steps = [each for each in assessment.evaluation.steps if each.verdict is Verdict.MISSED]
+    first = min((each.change for each in steps), key=lambda change: change.time_s)
+    at_border = sum(each.change.border for each in steps)
+    counts = {"changes of rate": len(steps) - at_border, "on or off at the border": at_border}
+    many = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
+    valves = sorted({each.change.valve for each in steps})
+    names = ", ".join(flight.setup.boom.valves[valve].name for valve in valves)
+    north_deg, east_deg = flight.setup.frame.to_geographic(
+        float(np.interp(first.time_s, flight.time_s, flight.east_m)),
+        float(np.interp(first.time_s, flight.time_s, flight.north_m)),
+    )
+    return (
+        f"Never happened, according to the journal: {many} (valves {names}; the first at "
+        f"{clock.text(first.time_s) or 'a time not known'}, {north_deg:.6f}, {east_deg:.6f})."
+    )
 
 
 def _labels(record: LegalRecord) -> Iterator[str]:
@@ -592,7 +613,8 @@ DEFINITIONS: dict[str, tuple[str, str, str]] = {
     "misapplied_percent": (
         "Misapplied",
         "%",
-        "too much and too little under the strips, each pass by itself, over what was prescribed",
+        "too much and too little where a valve's strip lay wholly in the field, each pass by "
+        "itself, over what was prescribed there; bare ground along the border is not in it",
     ),
     "border_margin_m": (
         "Border margin",

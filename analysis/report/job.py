@@ -58,6 +58,11 @@ def build_job(
     sorties = one_job(journals)
     parts = [judged(each.path, options, say=say) for each in sorties]
     _refuse_moved(parts)
+    names = [each.path.name for each in sorties]
+    if len({*names}) < len(names):  # of several aircraft, or simulated ones
+        names = ["/".join(each.path.parts[-2:]) for each in sorties]
+    for each, name in zip(parts, names, strict=True):
+        each.contents["flight"]["file"] = name
     treated = treated_of(*(each.flight for each in parts))
     flown = [each.assessment for each in parts if each.assessment is not None]
     found = together(flown, treated) if flown else None

@@ -22,6 +22,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+from analysis.flown.modelled_flow import meter_text
 from analysis.report.clock import SOURCES
 from analysis.report.legal_fields import FIELDS, LABELS, REAL_FLIGHT, Facts, label_of
 from companion.config.application_table import Profile, is_told
@@ -64,6 +65,7 @@ class Entry:
     said: str
     replaced: Any = None
     is_optional: bool = False
+    key: str = ""
 
     @property
     def is_missing(self) -> bool:
@@ -132,6 +134,7 @@ class LegalRecord:
                     "value": entry.value,
                     "unit": entry.unit,
                     "said": entry.said,
+                    **({"key": entry.key} if entry.key and entry.is_missing else {}),
                     **({} if entry.replaced is None else {"replaced": entry.replaced}),
                 }
                 for entry in self.entries
@@ -196,6 +199,7 @@ def _entry(key: str, told: Told) -> Entry:
         unit=unit,
         said=said,
         replaced=told.before.get(key),
+        key=key,
     )
 
 
@@ -253,7 +257,8 @@ def _remarks(told: Told, facts: Facts) -> Iterator[str]:
     if facts.has_area:
         beside = ""
         if facts.volume_by == "flow meter" and facts.modelled_l is not None:
-            beside = f"; by the model of the executed changes {facts.modelled_l:.3f} L"
+            sure = meter_text(facts.volume_l, facts.modelled_l)
+            beside = f"{sure}; by the model of the executed changes {facts.modelled_l:.3f} L"
         yield f"quantities are by the {facts.volume_by}{beside}"
     if facts.clock_source == "operator":
         yield "times are as the operator gave them"

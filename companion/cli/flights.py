@@ -69,10 +69,15 @@ Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Journals, 
 
 @app.command("list", epilog="Example: vrspray flights list --config config.toml")
 def list_flights(
-    folder: Folder = None, config_file: ConfigFile = None, as_json: AsJson = False
+    place: Annotated[
+        Path | None, typer.Argument(metavar="[DIR]", help="The same as --folder.")
+    ] = None,
+    folder: Folder = None,
+    config_file: ConfigFile = None,
+    as_json: AsJson = False,
 ) -> None:
     """List flights: file, start, duration, state, litres, size."""
-    where, _ = place_of(folder, config_file)
+    where, _ = place_of(folder or place, config_file)
     flights = []
     told_s = time.monotonic()
     paths = journals(where)
@@ -185,7 +190,8 @@ def line_of(flight: Flight) -> str:
     parts += [flight.state, f"{flight.size_bytes / 1e6:.1f} MB"]
     if flight.is_pinned:
         parts.append("pinned")
-    if flight.training not in (None, "no"):
+    is_simulated = flight.simulated is not None and flight.simulated.is_simulated
+    if flight.training not in (None, "no", "simulated" if is_simulated else None):
         parts.append(f"training: {flight.training}")
     if flight.simulated is not None and flight.simulated.label and not flight.simulated.is_unmarked:
         parts.append(flight.simulated.label)

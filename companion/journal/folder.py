@@ -93,7 +93,7 @@ def journals(folder: Path) -> list[Path]:
         ]
     except OSError as error:
         raise JournalError(
-            f"{folder}: cannot be read ({error.strerror}); name the folder of the flights"
+            f"{folder}: cannot be read ({error.strerror}); name the folder of flights with --folder"
         ) from error
     return [folder / name for name in sorted(names, key=_number)]
 

@@ -323,6 +323,12 @@ def test_late_changes_are_to_blame_for_the_ground_behind_boundaries() -> None:
     assert found.causes.by_cause[Cause.UNEXPLAINED] < 1.0
 
 
+def test_ground_behind_a_short_hold_is_named_by_its_reason_too() -> None:
+    """Lag and period outlast the hold: what fell short then had no reason of its own."""
+    found = assess(eastwards(shut_m=(30.0, 30.2), inhibit="wrong-mode"))
+    assert set(found.causes.by_inhibit) == {"wrong-mode"}
+
+
 def test_what_an_inhibit_closes_is_named_by_its_reason() -> None:
     found = assess(eastwards(shut_m=(27.0, 33.0), inhibit="wrong-mode"))
     assert found.causes.by_cause[Cause.INHIBIT] == pytest.approx(36.0, rel=0.1)

@@ -25,11 +25,13 @@ from analysis.assess.ground import Treated, treated_of
 from analysis.exports.cli import export
 from analysis.exports.output import ExportError
 from analysis.exports.source import Source
+from analysis.flown.modelled_flow import ordered_s
 from analysis.flown.read_applied import read_applied
 from analysis.journals.jobs import sortie_of
 from analysis.report.build import Report, ReportOptions, build_report
 from analysis.report.job import build_job
 from companion.cli.app import execute
+from companion.web.live import BoomTrace
 from tests.companion.web_site import served, until
 from tests.ground_judge import Field, Truth, Verdict, doses_of, judge, swaths_of, to_local
 
@@ -232,6 +234,26 @@ def test_fleet_and_flights_print_what_the_truth_says(
     assert rest["field_ha"] * 1e4 == pytest.approx(true.field_m2, rel=1e-3)
 
 
+def test_the_page_in_flight_shows_what_the_truth_says(flown: Flown) -> None:
+    flight, true = flown.assessed.flight, flown.verdict
+    boom, at_s = flight.setup.boom, ordered_s(flight.changes)
+    duty = [0.0] * len(boom.valves)
+    way = BoomTrace(valves=tuple((v.right_m, v.forward_m, v.width_m) for v in boom.valves))
+    change = 0
+    for sample, now_s in enumerate(flight.time_s.tolist()):
+        while change < len(at_s) and at_s[change] <= now_s:
+            duty[int(flight.changes.valve[change])] = float(flight.changes.duty[change])
+            change += 1
+        vehicle = {
+            "east_m": float(flight.east_m[sample]), "north_m": float(flight.north_m[sample]),
+            "heading_deg": float(flight.heading_deg[sample]), "in_air": True,
+        }  # fmt: skip
+        flow = float(flight.flow_l_min[sample])
+        way.take({"now_s": now_s, "flow_l_min": flow, "duty": duty, "vehicle": vehicle})
+    assert way.area_ha * 1e4 == pytest.approx(true.treated_m2, abs=AREA * true.field_m2)
+    assert way.volume_l == pytest.approx(true.applied_l, rel=2.0 * LITRES)
+
+
 def test_metered_and_modelled_litres_are_the_same_in_all_files(flown: Flown) -> None:
     said = flown.contents["verdict"]
     facts = Source(flight=flown.assessed.flight, shape="swaths").facts()
@@ -363,6 +385,8 @@ def test_the_litres_of_a_job_are_what_the_truth_says(job: Job) -> None:
     for row, flight in zip(rows, job.flights, strict=True):
         assert row["applied_l"] == pytest.approx(flight.verdict.applied_l, rel=LITRES)
         assert row["spraying_from"] < row["spraying_until"]
+    # All are called flight-0001.gpkg.
+    assert len({row["journal"] for row in rows}) == len(rows)
 
 
 def test_the_record_of_a_job_has_its_ground_and_litres_once_and_each_sortie(job: Job) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -47,6 +48,13 @@ def test_headline_tiles_balance_and_record_of_a_recorded_flight_agree(name: str)
         report = build_report(path, ReportOptions(profiles=PROFILES, with_figures=False))
     if "balance" in report.contents and report.contents["verdict"]["applied_by"] != "nothing":
         assert list(disagreements(report)) == []
+    contents = report.contents
+    for warning in (each for each in contents["warnings"] if each["code"] == "missed"):
+        counts, _, first = warning["text"].partition("(")
+        assert sum(map(int, re.findall(r"\d+", counts))) == contents["missed"]
+        place = [float(each) for each in re.findall(r"-?\d+\.\d{6}", first)]
+        near = [contents["flight"][f"{name}_deg"] for name in ("latitude", "longitude")]
+        assert place == pytest.approx(near, abs=0.01)
 
 
 def test_litres_are_metered_where_there_is_a_meter(flight: AppliedFlight) -> None:

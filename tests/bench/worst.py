@@ -74,7 +74,9 @@ def disagreements(report: Report) -> Iterator[str]:
     off = balance["meter_to_prescribed_percent" if is_metered else "model_to_prescribed_percent"]
     how = "modelled, not metered"
     if is_metered:
-        how = f"by the flow meter; modelled {balance['model_l']:.2f} L"
+        within = balance["meter_within_percent"]
+        sure = ", which the curves contradict" if within is None else f", ±{within:.0f} %"
+        how = f"by the flow meter{sure}; modelled {balance['model_l']:.2f} L"
     sentence = verdict["sentence"]
     for part in (
         f"{applied_l:.2f} L",
