@@ -32,8 +32,7 @@ class Format:
     """A format; `make` is `module:function`, `shapes` what a row may be, the usual one first.
 
     `suffixes` choose it without its name, `also` only with it. With `has_units` it can be had in
-    other units than the recorded ones; others have units of their own. With `has_sorties` one file
-    holds a whole job.
+    other units than the recorded ones; others have units of their own.
     """
 
     name: str
@@ -44,7 +43,6 @@ class Format:
     shapes: tuple[Shape, ...] = ("points",)
     has_units: bool = False
     has_rate: bool = True
-    has_sorties: bool = True
 
     def maker(self) -> Make:
         """Return the function that makes it, imported now."""
@@ -61,7 +59,7 @@ FORMATS = (
     Format(
         name="csv-samples", description="path and flow of each valve every 10 ms",
         make="csv_tables:make_samples", suffixes=(), also=(".csv",), shapes=("steps",),
-        has_rate=False, has_sorties=False,
+        has_rate=False,
     ),
     Format(
         name="geojson", description="points or swaths", make="geojson:make",
@@ -233,7 +231,7 @@ def _of_a_job(form: Format, journals: list[Path]) -> list[Path]:
     """Return the journals in order of time; ExportError where a file holds one flight."""
     from analysis.journals.jobs import one_job
 
-    if not form.has_sorties:
+    if form.shapes == ("steps",):
         raise ExportError(f"{form.name} holds one flight; export each sortie by itself")
     return [each.path for each in one_job(journals)]
 

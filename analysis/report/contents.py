@@ -541,17 +541,18 @@ def _never_happened(assessment: Assessment, clock: Clock) -> str:
     steps = [each for each in assessment.evaluation.steps if each.verdict is Verdict.MISSED]
     first = min((each.change for each in steps), key=lambda change: change.time_s)
     at_border = sum(each.change.border for each in steps)
-    counts = {"changes of rate": len(steps) - at_border, "on or off at the border": at_border}
-    many = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
+    many = f"{len(steps) - at_border} changes of rate, {at_border} on or off at the border"
     valves = sorted({each.change.valve for each in steps})
     names = ", ".join(flight.setup.boom.valves[valve].name for valve in valves)
-    north_deg, east_deg = flight.setup.frame.to_geographic(
-        float(np.interp(first.time_s, flight.time_s, flight.east_m)),
-        float(np.interp(first.time_s, flight.time_s, flight.north_m)),
-    )
+    place = [
+        float(np.interp(first.time_s, flight.time_s, each))
+        for each in (flight.east_m, flight.north_m)
+    ]
+    latitude_deg, longitude_deg = flight.setup.frame.to_geographic(*place)
     return (
         f"Never happened, according to the journal: {many} (valves {names}; the first at "
-        f"{clock.text(first.time_s) or 'a time not known'}, {north_deg:.6f}, {east_deg:.6f})."
+        f"{clock.text(first.time_s) or 'a time not known'}, {latitude_deg:.6f}, "
+        f"{longitude_deg:.6f})."
     )
 
 

@@ -24,8 +24,8 @@ HEAD = """<!-- Written by `python -m tests.bench.ground_figures --page`; do not 
 # Figures of the report
 
 `tests/ground_judge.py` counts from the truth of simulated flights what fell where, with no code of
-the program. `tests/analysis/test_judged_figures.py` holds report, record, fleet, `flights` and
-exports against it. Report / truth, with valves and meter alike:
+the program. `tests/analysis/test_judged_figures.py` holds report, record, page, fleet, `flights`
+and exports against it. Report / truth, with valves and meter alike:
 
 """
 SCATTER = """
