@@ -28,7 +28,7 @@ from analysis.assess.cell_maps import CellMaps, cell_maps
 from analysis.assess.ground import Ground, Treated, ground_of, treated_of
 from analysis.dose import flow_samples, misapplied_parts
 from analysis.evaluation import Changes, Distances, Evaluation, changes_of, evaluate_strips
-from analysis.flown.applied_record import STEP_S, Source, modelled_ml, record_of
+from analysis.flown.applied_record import record_of
 from analysis.flown.holes import GAP_S
 from analysis.flown.modelled_flow import meter_within_percent, metered_l, ordered_s
 from analysis.lag import Verdict
@@ -289,7 +289,6 @@ class Assessment:
     """
 
     flight: AppliedFlight
-    source: Source
     record: FlightRecord
     strips: tuple[Strip, ...]
     evaluation: Evaluation
@@ -314,7 +313,7 @@ class Assessment:
             "training": flight.training,
             "simulated": flight.simulated.word,
             "simulated_because": flight.simulated.because,
-            "source": self.source,
+            "source": "model",
             "utc_source": flight.utc_source,
             **self.evaluation.as_json(),
             "worst": self.worst.as_json(),
@@ -409,23 +408,16 @@ def together(parts: Sequence[Assessment], treated: Treated) -> Essentials:
 def assess(
     flight: AppliedFlight,
     *,
-    source: Source = "model",
-    step_s: float = STEP_S,
     cell_m: float | None = None,
     treated: Treated | None = None,
 ) -> Assessment:
     """Return everything of a flight; EvaluationError where it has nothing to evaluate."""
-    record = record_of(flight, step_s=step_s, source=source)
+    record = record_of(flight)
     strips = strips_of(record)
     evaluation = evaluate_strips(record, strips)
-    modelled = evaluation.applied_ml
-    if source != "model":
-        volume_ml = modelled_ml(flight, record.time_s)
-        modelled = float((volume_ml[-1] - volume_ml[0]).sum())
     ground = ground_of(flight, record, strips, treated or treated_of(flight))
     return Assessment(
         flight=flight,
-        source=source,
         record=record,
         strips=tuple(strips),
         evaluation=evaluation,
@@ -437,10 +429,10 @@ def assess(
         ),
         causes=causes_of(flight, strips, evaluation.steps, ground),
         ground=ground,
-        balance=balance_of(flight, modelled, ground.asked_l),
+        balance=balance_of(flight, evaluation.applied_ml, ground.asked_l),
         durations=_durations(flight),
         counts=_counts(flight, evaluation),
-        notes=tuple(_notes(flight, source)),
+        notes=tuple(_notes(flight)),
     )
 
 
@@ -536,14 +528,12 @@ def _counts(flight: AppliedFlight, evaluation: Evaluation) -> dict[str, int]:
     }
 
 
-def _notes(flight: AppliedFlight, source: Source) -> Iterable[str]:
+def _notes(flight: AppliedFlight) -> Iterable[str]:
     """Yield what a reader of the figures has to know."""
     yield (
         "positions are the autopilot's, flows are modelled from the executed changes: errors of "
         "position, lags and flow curves are not in these figures"
     )
-    if source == "meter" and flight.meter_ml is None:
-        yield "there is no flow meter in the journal: the volume is the model's"
     if flight.setup.pumping is not None:
         yield "the pump makes the flow: changes are known to the time between two decisions only"
     if not np.isfinite(flight.changes.actual_s).any():

@@ -10,13 +10,13 @@ from __future__ import annotations
 import tomllib
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from analysis.flight_record import FlightMeta, FlightRecord, Orders
 from analysis.flown.holes import with_gaps
-from analysis.flown.modelled_flow import metered, ordered_s, pumped_ml, valve_flows
+from analysis.flown.modelled_flow import ordered_s, pumped_ml, valve_flows
 from companion.errors import VrsprayError
 
 if TYPE_CHECKING:
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from analysis.flight_record import Spans
     from analysis.flown.applied_flight import AppliedFlight, Floats
 
-Source = Literal["model", "meter"]
 STEP_S = 0.01
 SAMPLES_MIN = 3
 
@@ -34,26 +33,16 @@ class EvaluationError(VrsprayError):
     """A flight of which nothing can be evaluated."""
 
 
-def record_of(
-    flight: AppliedFlight, *, step_s: float = STEP_S, source: Source = "model"
-) -> FlightRecord:
-    """Return the flight as the metrics take it; EvaluationError where it never had a position.
-
-    `meter` scales the modelled volume, window by window, to what the flow meter has counted.
-    """
-    if not step_s > 0.0:
-        raise ValueError(f"step_s must be positive, got {step_s}")
-    samples = int(flight.duration_s / step_s + 1e-6) + 1
+def record_of(flight: AppliedFlight) -> FlightRecord:
+    """Return the flight as the metrics take it; EvaluationError where it never had a position."""
+    samples = int(flight.duration_s / STEP_S + 1e-6) + 1
     if samples < SAMPLES_MIN:
         raise EvaluationError(
             f"{flight.path}: the flight has {len(flight.time_s)} decisions with a position; "
             "there is nothing to evaluate"
         )
     setup = flight.setup
-    time_s = flight.time_s[0] + step_s * np.arange(samples, dtype=np.float64)
-    volume_ml = modelled_ml(flight, time_s)
-    if source == "meter":
-        volume_ml = metered(flight, time_s, volume_ml)
+    time_s = flight.time_s[0] + STEP_S * np.arange(samples, dtype=np.float64)
     makes_flow = setup.pumping is not None
     limits = (0.0, float("inf")) if makes_flow else (setup.pwm.duty_min, setup.pwm.duty_max)
     return FlightRecord(
@@ -61,7 +50,7 @@ def record_of(
         east_m=np.interp(time_s, flight.time_s, flight.east_m),
         north_m=np.interp(time_s, flight.time_s, flight.north_m),
         heading_deg=heading_deg(flight, time_s),
-        volume_ml=volume_ml,
+        volume_ml=modelled_ml(flight, time_s),
         boom=setup.boom,
         prescription=setup.prescription,
         lines=setup.lines,

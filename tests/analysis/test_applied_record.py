@@ -13,7 +13,6 @@ from analysis.evaluation import evaluate
 from analysis.flown.applied_record import EvaluationError, record_of
 from analysis.flown.modelled_flow import (
     ML_S_PER_L_MIN,
-    WINDOW_ML,
     counted,
     flow_of,
     levels_ml_s,
@@ -168,28 +167,6 @@ def test_without_a_heading_the_course_stands_for_it() -> None:
 
 
 # ----------------------------------------------------------------------------------- the meter
-
-
-def test_the_meter_scales_the_model_window_by_window() -> None:
-    flight = eastwards()
-    record = record_of(flight)
-    total_ml = record.volume_ml.sum(axis=1)
-    half_ml = 0.5 * float(total_ml[-1])
-    # 4 % more in the first half, 2 % less in the second.
-    read_ml = np.where(
-        total_ml < half_ml, 1.04 * total_ml, 1.04 * half_ml + 0.98 * (total_ml - half_ml)
-    )
-    seen = record_of(with_meter(flight, record.time_s[::5], read_ml[::5]), source="meter")
-    ratio = seen.volume_ml.sum(axis=1) - read_ml
-    assert np.abs(ratio).max() < 0.06 * WINDOW_ML
-    assert seen.volume_ml[-1] / seen.volume_ml[-1].sum() == pytest.approx(1 / 6)
-
-
-def test_a_dead_meter_leaves_the_model_as_it_is() -> None:
-    flight = eastwards()
-    record = record_of(flight)
-    dead = with_meter(flight, record.time_s[::5], np.zeros(len(record.time_s[::5])))
-    assert record_of(dead, source="meter").volume_ml == pytest.approx(record.volume_ml)
 
 
 def test_a_count_that_begins_anew_goes_on_and_faults_are_left_out() -> None:

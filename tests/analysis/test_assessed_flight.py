@@ -17,7 +17,6 @@ from analysis.evaluation import Evaluation, evaluate
 from analysis.exports import csv_tables
 from analysis.exports.source import Source
 from analysis.flown.applied_flight import AppliedFlight
-from analysis.flown.applied_record import record_of
 from analysis.flown.modelled_flow import ordered_s
 from analysis.flown.read_applied import read_applied
 from analysis.flown.sensor_series import sensors_of
@@ -99,14 +98,11 @@ def test_a_journal_comes_near_the_truth_that_it_does_not_know(flown: Flown) -> N
     assert ours.misapplied_percent == pytest.approx(truth.misapplied_percent, abs=0.6)
 
 
-def test_the_meter_is_in_the_balance_and_may_scale_the_volume(flown: Flown) -> None:
+def test_the_meter_is_in_the_balance(flown: Flown) -> None:
     balance = flown.found.balance
     assert balance.meter_l is not None
     assert balance.meter_to_model_percent is not None
-    metered = record_of(flown.flight, source="meter")
-    total_l = float((metered.volume_ml[-1] - metered.volume_ml[0]).sum()) / 1000.0
-    assert total_l == pytest.approx(balance.meter_l, rel=0.01)
-    assert assess(flown.flight, source="meter").balance.model_l == pytest.approx(balance.model_l)
+    assert balance.meter_l == pytest.approx(balance.model_l, rel=0.05)
 
 
 # -------------------------------------------------------------------------------------- reading
