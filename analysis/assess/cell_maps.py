@@ -121,7 +121,6 @@ class CellMaps:
     passes: Floats
     duty: Floats
     speed_m_s: Floats
-    deviation_l_min: Floats
     histogram_l_ha: Histogram | None
     histogram_l_min: Histogram | None
 
@@ -334,7 +333,6 @@ def _maps(
         passes=np.where(sums.inside > 0.0, sums.inside, sums.area) / _cell_areas(*corners),
         duty=_share(sums.duty, sums.area, passed),
         speed_m_s=speeds,
-        deviation_l_min=flow_error,
         histogram_l_ha=Histogram.of((measured - commanded)[counts], "L/ha"),
         histogram_l_min=Histogram.of(flow_error[counts], "L/min"),
     )

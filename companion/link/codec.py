@@ -93,7 +93,6 @@ class Codec:
         self._source = Source(self.counts)
         self._senders: dict[tuple[int, int], _Sequence] = {}
         self.vehicle_counts: dict[int, int] = {}
-        self.ignored_count = 0
         # Frames that show who speaks from an address; a radio's report is signed by nobody.
         self.named_frame_count = 0
         self.vehicle_frame_count = 0
@@ -177,7 +176,6 @@ class Codec:
                 return replace(message, is_late=True)
             return message
         if not self.is_autopilot(*sender):
-            self.ignored_count += 1
             return None
         self.vehicle_counts[message_id] = self.vehicle_counts.get(message_id, 0) + 1
         if raw is None:

@@ -215,7 +215,6 @@ class UdpTransport(asyncio.DatagramProtocol):
         self._closed = asyncio.get_running_loop().create_future()
         self.is_up = True
         self._is_full = False
-        self.error_count = 0
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Take the socket over."""
@@ -272,10 +271,6 @@ class UdpTransport(asyncio.DatagramProtocol):
             return False
         del self._peers[strangers[0]]
         return True
-
-    def error_received(self, _exc: Exception) -> None:
-        """Count what the network reports: nobody listens yet, or no longer."""
-        self.error_count += 1
 
     def pause_writing(self) -> None:
         """Note that the system takes no more: what is sent now would be old when it leaves."""

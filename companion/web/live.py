@@ -133,7 +133,6 @@ class BoomTrace:
     points: list[list[Any]] = field(default_factory=list)
     coverage: Coverage = field(default_factory=Coverage)
     volume_l: float = 0.0
-    sprayed_m: float = 0.0
     _last: tuple[float, float] | None = None  # time, flow
 
     def take(self, frame: dict[str, Any]) -> list[Any] | None:
@@ -162,7 +161,7 @@ class BoomTrace:
                 return None
             joined = gone_m <= JUMP_M and 0.0 <= point[0] - last[0] <= GAP_S + gone_m
             if joined and "1" in last[4]:
-                self._stamp(last, point, gone_m)
+                self._stamp(last, point)
         elif not is_open:
             return None
         if len(self.points) >= POINTS_MAX:
@@ -170,10 +169,9 @@ class BoomTrace:
         self.points.append(point)
         return point
 
-    def _stamp(self, last: list[Any], point: list[Any], gone_m: float) -> None:
+    def _stamp(self, last: list[Any], point: list[Any]) -> None:
         quads = list(quads_between(self.valves, last, point))
         self.coverage = self.coverage.stamped(quads)
-        self.sprayed_m += gone_m
 
     @property
     def area_ha(self) -> float:

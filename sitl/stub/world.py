@@ -101,7 +101,6 @@ class Brake:
 
     def __init__(self, pose: Pose, *, deceleration_m_s2: float = 2.5) -> None:
         self._pose = pose
-        self._deceleration_m_s2 = deceleration_m_s2
         self._duration_s = pose.speed_m_s / deceleration_m_s2
 
     def advance(self, until_s: float) -> None:

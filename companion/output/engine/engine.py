@@ -357,7 +357,6 @@ class LateEdges:
         self._valves = valves
         self._min_on_s, self._min_off_s = min_on_s, min_off_s
         self._waiting: set[int] = set()
-        self.held_count = 0
 
     def add(self, edges: Iterable[Edge]) -> None:
         """Take edges in the order of their times."""
@@ -402,8 +401,6 @@ class LateEdges:
                 out.append(edge)
             if not line.queue:
                 self._waiting.discard(number)
-            else:
-                self.held_count += 1
         return out
 
     def _all_at_once(self, edges: list[Edge], now_s: float) -> bool:
