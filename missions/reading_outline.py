@@ -32,6 +32,8 @@ T = TypeVar("T")
 
 # The nearest land is 1.4 degrees south and 5.6 east of 0, 0.
 AT_SEA_DEG = 1.0
+# 1 km at 26 degrees of latitude; beyond that less, and more than a fence needs.
+MERIDIAN_DEG = 0.01
 
 
 # What a file leaves open, by the code of its refusal, and what answers it.
@@ -83,7 +85,9 @@ def outline_of(
             raise error from None  # no map of cells either: what is missing is an outline
         if cells is None or cells.cells is None:
             raise
-        return _of_cells(cells)
+        found = _of_cells(cells)
+        check_degrees(found, path)
+        return found
 
 
 # Beyond the hull of a map's zones, so that the ground between spots counts as mapped: a share of
@@ -152,10 +156,19 @@ def _hull_of_cells(prescription: Prescription, outline: BaseGeometry) -> tuple[B
 def check_degrees(area: Area, path: Path) -> None:
     """Refuse metres of a local origin that were read as degrees: they begin at 0, 0.
 
+    And what lies so near the 180th meridian that its fence or a turn could cross it: autopilots
+    compare longitudes as plain numbers, and such a fence goes round the world.
+
     Raises:
-        PlanError: for what lies beside 0, 0 in the Gulf of Guinea, where no field is.
+        PlanError: for either; no field lies beside 0, 0, in the Gulf of Guinea.
     """
     west, south, east, north = area.bounds
+    if max(abs(west), abs(east)) > 180.0 - MERIDIAN_DEG:
+        raise PlanError(
+            f"{path}: the outline lies at the 180th meridian ({west:.5f} to "
+            f"{east:.5f}), over which no autopilot's fence can be drawn; plan the ground on one "
+            "side, a kilometre from it"
+        )
     beside = west <= AT_SEA_DEG and east >= -AT_SEA_DEG
     if beside and south <= AT_SEA_DEG and north >= -AT_SEA_DEG:
         raise PlanError(

@@ -18,6 +18,8 @@ from shapely.errors import ShapelyError
 from companion.errors import MapError
 from missions.maps.cells import check_place, corner
 from missions.maps.crs import (
+    EXTENT_MAX_M,
+    METRES_PER_DEGREE,
     Objects,
     check_edges,
     crs_name,
@@ -48,6 +50,8 @@ from missions.maps.overlaps import check_crossings
 _NAME_COLUMNS = ("name", "zonename", "zone", "zoneid", "zone_id", "label", "id", "fid", "level")
 
 _CRS_FIX = "give it with --crs (--crs EPSG:4326 for GPS coordinates), or copy the missing file"
+# Less does not show in the figures.
+_SAME_M2 = 0.005
 _PROJECTION_FIX = "give with --crs the projection that it was made in, or copy the missing file"
 
 
@@ -68,6 +72,8 @@ class Repair:
     @property
     def text(self) -> str:
         """Return what was wrong, and what the repair does to the area."""
+        if self.change_m2 < _SAME_M2:
+            return f"rings touch or repeat themselves ({self.reason}), without change of the area"
         return (
             f"rings cross themselves ({self.reason}); the repair changes the area "
             f"from {self.before_m2:.2f} to {self.after_m2:.2f} m2"
@@ -157,7 +163,10 @@ def map_of(
 def _once(zones: list[MapZone]) -> tuple[tuple[MapZone, ...], list[Problem]]:
     """Return the zones without those drawn a second time with the same rate, and which they are."""
     shapes = np.array([zone.geometry for zone in zones], dtype=object)
-    rates = [-1.0 if zone.rate_l_ha is None else zone.rate_l_ha for zone in zones]
+    rates = [
+        -1.0 - index if zone.rate_l_ha is None else zone.rate_l_ha
+        for index, zone in enumerate(zones)
+    ]
     rows = np.column_stack([shapely.bounds(shapes), rates])
     _, first, row = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     if len(first) == len(zones):
@@ -189,7 +198,7 @@ def _map_of_grid(
     if choice.column.fault is not None:
         raise choice.column.fault
     unit = unit_of(found, choice.column, given=given, path=path)
-    rates = choice.column.values * unit.l_ha
+    rates = choice.column.values * unit.l_ha + 0.0  # no -0
     with np.errstate(invalid="ignore"):
         wrong = ~np.isnan(rates) & ~((rates >= 0.0) & (rates < RATE_MAX_L_HA))
     if wrong.any():
@@ -306,7 +315,7 @@ def _rates(column: Column, unit: Unit, names: Sequence[str], path: Path) -> list
             number = as_number(value)
         except ValueError:
             raise _bad_rate(path, column, f"zone {name}", value) from None
-        rate = None if number is None else number * unit.l_ha
+        rate = None if number is None else number * unit.l_ha + 0.0  # no -0
         if rate is not None and not 0.0 <= rate < RATE_MAX_L_HA:
             raise _bad_rate(path, column, f"zone {name}", value)
         rates.append(rate)
@@ -331,7 +340,21 @@ def ground_of(
     here = _polygons(layer, path)
     try:
         native: Objects = np.array([layer.geometries[index] for index in here], dtype=object)
-        areas = to_longitude_latitude(native, crs, path=path)
+        try:
+            areas = to_longitude_latitude(native, crs, path=path)
+        except MapError as error:
+            strays = _strays(native, crs)
+            if not strays:
+                raise
+            listed = ", ".join(names[here[index]] for index in strays[:5])
+            raise map_error(
+                path,
+                f"{len(strays)} of {len(here)} records lie far from all others: {listed}"
+                + (", …" if len(strays) > 5 else "")
+                + f" ({str(error).removeprefix(f'{path}: ').removesuffix(f'; {error.fix}')})",
+                fix="delete them where the map is made",
+                code=error.code or "out-of-range",
+            ) from None
         repaired, repairs = _repaired(areas, [names[index] for index in here], path)
         check_edges(np.array([area for area in repaired if area is not None], dtype=object), path)
     except ShapelyError as error:
@@ -362,6 +385,16 @@ def _polygons(layer: Layer, path: Path) -> list[int]:
             code="no-polygon",
         )
     return here
+
+
+def _strays(native: Objects, crs: CRS) -> list[int]:
+    """Return which records lie farther from the middle than a map reaches, if they are few."""
+    west, south, east, north = shapely.bounds(native).T
+    middles = np.column_stack([west + east, south + north]) / 2.0
+    away = np.hypot(*(middles - np.median(middles, axis=0)).T)
+    reach = EXTENT_MAX_M / (METRES_PER_DEGREE if crs.is_geographic else 1.0)
+    far = np.flatnonzero(~(away <= reach)).tolist()
+    return far if len(far) < len(native) / 2 else []
 
 
 def _repaired(

@@ -121,6 +121,27 @@ def _into_degrees(crs: CRS) -> Transformer:
     return Transformer.from_crs(crs, WGS84, always_xy=True)
 
 
+def over_180(points: Floats) -> Floats:
+    """Return degrees that go on beyond 180 where the ground lies on both sides of the meridian.
+
+    RFC 7946 has it cut there, other programs write 180.0004 or -180.0004; all others are as before.
+    """
+    x = points[:, 0]
+    beyond = bool((np.abs(x) > 180.0).any()) or (bool((x < 0.0).any()) and bool((x > 0.0).any()))
+    size = np.abs(x)
+    near = (size >= _NEAR_180_DEG) & (size <= 180.0 + LONGITUDES_MAX_DEG)
+    if not (len(x) and beyond and bool(near.all())):
+        return points
+    moved = np.where(x < 0.0, x + 360.0, x)
+    return np.column_stack([moved - 360.0 if (moved >= 180.0).all() else moved, points[:, 1]])
+
+
+def _spans_180(geometries: Objects) -> bool:
+    """Tell a ring with degrees on both sides of the meridian: it is cut there, or goes round."""
+    rings = shapely.bounds(shapely.get_parts(geometries))
+    return bool((rings[:, 2] - rings[:, 0] > 180.0).any())
+
+
 def to_longitude_latitude(geometries: Objects, crs: CRS, *, path: Path) -> Objects:
     """Return the geometries in WGS84 longitude and latitude, or refuse what cannot lie there."""
     coordinates = shapely.get_coordinates(geometries)
@@ -132,12 +153,16 @@ def to_longitude_latitude(geometries: Objects, crs: CRS, *, path: Path) -> Objec
             code="broken-geometry",
         )
     if is_wgs84(crs):
-        check_place(coordinates, coordinates, crs, path)
+        whole = coordinates if _spans_180(geometries) else over_180(coordinates)
+        check_place(whole, coordinates, crs, path)
+        if whole is not coordinates:
+            geometries = shapely.set_coordinates(geometries.copy(), whole)
         return geometries
-    transformer = _into_degrees(crs)
+    transformer, jumps = _into_degrees(crs), _spans_180(geometries)
 
     def transform(points: Floats) -> Floats:
-        return np.column_stack(transformer.transform(points[:, 0], points[:, 1]))
+        degrees = np.column_stack(transformer.transform(points[:, 0], points[:, 1]))
+        return degrees if crs.is_geographic and jumps else over_180(degrees)
 
     if crs.is_geographic and looks_like_metres(coordinates):
         check_place(coordinates, coordinates, crs, path)
@@ -238,7 +263,9 @@ def check_place(points: Floats, raw: Floats, crs: CRS, path: Path) -> None:
     if not len(points):
         return
     longitude, latitude = np.abs(points).T
-    if not bool((longitude <= 180.0).all() and (latitude <= 90.0).all()):
+    over = _NEAR_180_DEG <= float(points[:, 0].min()) < 180.0
+    most = 180.0 + (LONGITUDES_MAX_DEG if over else 0.0)
+    if not bool((longitude <= most).all() and (latitude <= 90.0).all()):
         raise _out_of_range(raw, crs, path)
     _check_degrees_in_metres(raw, crs, path)
     _check_area_of_use(points, raw, crs, path)

@@ -89,8 +89,10 @@ def project(
 def frame_around(geometries: Iterable[Geometry]) -> LocalFrame:
     """Return the frame whose origin is the centre of the bounds of all geometries."""
     west, south, east, north = shapely.total_bounds(np.array(list(geometries), dtype=object))
+    middle = float((west + east) / 2)
     return LocalFrame(
-        latitude_deg=float((south + north) / 2), longitude_deg=float((west + east) / 2)
+        latitude_deg=float((south + north) / 2),
+        longitude_deg=middle if middle <= 180.0 else middle - 360.0,
     )
 
 

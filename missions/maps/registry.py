@@ -26,7 +26,7 @@ from missions.maps.adapt import (
 from missions.maps.assemble import crs_of, ground_of, map_of, zone_names
 from missions.maps.bundle import Bundle, open_bundle
 from missions.maps.cells import cells_of
-from missions.maps.crs import Floats, to_longitude_latitude
+from missions.maps.crs import Floats, over_180, to_longitude_latitude
 from missions.maps.csvfile import read_csv
 from missions.maps.fields import Given
 from missions.maps.geojson import is_geojson, read_geojson
@@ -493,7 +493,7 @@ def _degrees(areas: Sequence[Area], frame: LocalFrame) -> list[Area]:
         latitudes, longitudes = frame.to_geographic_all(
             places[:, 0].tolist(), places[:, 1].tolist()
         )
-        return np.column_stack([longitudes, latitudes])
+        return over_180(np.column_stack([longitudes, latitudes]))
 
     found = shapely.transform(np.array(areas, dtype=object), there)
     return [area for area in found if isinstance(area, Polygon | MultiPolygon)]

@@ -201,7 +201,7 @@ def read_mission_file(path: Path) -> MissionFile:
     try:
         if path.stat().st_size > BYTES_MAX:
             raise UploadError(f"{path}: too large for a mission")
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
         if not text.strip():
             raise UploadError(f"{path}: the file is empty; write it again with vrspray plan --out")
         found = reader(path, text)

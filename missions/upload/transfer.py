@@ -269,7 +269,7 @@ def sorties_from(path: Path) -> list[Path]:
 def _count(lines: Path, path: Path) -> int:
     """Return the number of sorties of a plan."""
     try:
-        features = json.loads(lines.read_text(encoding="utf-8"))["features"]
+        features = json.loads(lines.read_text(encoding="utf-8-sig"))["features"]
         sorties = {each["properties"].get("sortie") for each in features} - {None}
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UploadError(

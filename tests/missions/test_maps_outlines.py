@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from shapely import MultiPolygon, Polygon, affinity, box
+from shapely.geometry import mapping
 
 from companion.cli.app import execute
 from companion.errors import MapError
-from missions.maps.lint import check_map
+from missions.errors import PlanError
+from missions.maps.lint import check_map, point_rates
 from missions.maps.registry import read_area, read_map
 from missions.maps.totals import totals
 from missions.reading_outline import outline_of, told
@@ -300,3 +303,70 @@ def test_a_flight_map_is_read_by_its_own_rule_of_overlaps(
     assert asked("rate", str(path), "48.0002", "11.0006")["rate_l_ha"] == 30.0
     assert execute(["map", "check", str(path), "--overlap", "min"]) == 2
     assert "it was compiled with the rule max" in capsys.readouterr().err
+
+
+# The 180th meridian: RFC 7946 cuts a field there, others write 180.0004 or -180.0004.
+
+HALVES = (box(179.9996, -17.0, 180.0, -16.9995), box(-180.0, -17.0, -179.9996, -16.9995))
+
+
+def over_meridian(folder: Path, *polygons: Polygon | MultiPolygon) -> Path:
+    path = folder / "fiji.geojson"
+    features = [
+        {"type": "Feature", "geometry": mapping(one), "properties": {"rate": 20.0, "unit": "L/ha"}}
+        for one in polygons
+    ]
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    return path
+
+
+@pytest.mark.parametrize(
+    "polygons",
+    [
+        (MultiPolygon(HALVES),),
+        HALVES,
+        (box(179.9996, -17.0, 180.0004, -16.9995),),
+        (box(-180.0004, -17.0, -179.9996, -16.9995),),
+    ],
+    ids=["parts", "records", "beyond 180", "beyond -180"],
+)
+def test_a_map_over_the_180th_meridian_is_one_field(
+    tmp_path: Path, polygons: tuple[Polygon | MultiPolygon, ...]
+) -> None:
+    path = over_meridian(tmp_path, *polygons)
+    found = read_map(path)
+    assert totals(found).area_ha == pytest.approx(0.4713, rel=1e-3)
+    both = point_rates(found, [(-16.9998, 179.9998), (-16.9998, -179.9998), (-16.9998, 179.9)])
+    assert [row["rate_l_ha"] for row in both] == [20.0, 20.0, None]
+    with pytest.raises(PlanError, match="180th meridian"):
+        outline_of(path, None, [])
+    compiled = tmp_path / "f.flightmap.gpkg"
+    assert execute(["map", "compile", str(path), "--out", str(compiled)]) in (0, 1)
+    again = read_map(compiled)
+    assert totals(again).area_ha == pytest.approx(0.4713, rel=1e-3)
+
+
+def test_no_plan_is_made_beside_the_180th_meridian(tmp_path: Path) -> None:
+    path = over_meridian(tmp_path, box(179.9988, -17.0, 179.99998, -16.9995))
+    with pytest.raises(PlanError, match="180th meridian"):
+        outline_of(path, None, [])
+
+
+def test_longitudes_of_two_continents_are_not_brought_together(tmp_path: Path) -> None:
+    with pytest.raises(MapError, match="degrees of longitude"):
+        read_map(over_meridian(tmp_path, box(170, 0, 170.001, 1), box(-140, 0, -139.9, 1)))
+
+
+def test_a_rate_of_minus_nothing_is_nothing(tmp_path: Path) -> None:
+    made = Ground(polygons=(FIELD,), columns={"rate": [-0.0]})
+    found = read_map(writers.geojson_by_hand(made, tmp_path), unit="L/ha")
+    assert f"{found.rates_l_ha[0]:g}" == "0"
+
+
+@every_format
+def test_records_far_from_all_others_are_named(tmp_path: Path, write: writers.Writer) -> None:
+    far = [affinity.translate(FIELD, 60.0 * k + 3e6 * (k > 3), 0.0) for k in range(6)]
+    path = write(ground(*far), tmp_path)
+    for read in (partial(read_map, unit="L/ha"), read_area):
+        with pytest.raises(MapError, match="2 of 6 records lie far from all others: 5, 6 "):
+            read(path)  # type: ignore[operator]
