@@ -21,6 +21,7 @@ from companion.core.frame import LocalFrame
 from companion.csv_table import csv_text
 from companion.errors import MapError
 from companion.map_formats import geojson_feature, geojson_text
+from companion.wording import typed
 from missions.make.cleaning import (
     STEPS,
     Cleaned,
@@ -185,7 +186,7 @@ def _column(path: Path, columns: Mapping[str, Floats], wanted: str | None) -> st
         return names[wanted.casefold()]
     if wanted is None and len(names) == 1:
         return next(iter(names.values()))
-    shown = ", ".join(list(columns)[:12]) or "none"
+    shown = typed(list(columns)[:12]) or "none"
     raise map_error(
         path,
         f"it has no column {wanted!r} of numbers; it has {shown}"

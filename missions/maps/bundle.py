@@ -26,6 +26,7 @@ from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
 
 from companion.errors import MapError
+from companion.wording import typed
 from missions.maps.model import MAX_FILE_BYTES, map_error, read_bytes
 
 # ---------------------------------------------------------------------------------------------- XML
@@ -420,9 +421,10 @@ def one_of(bundle: Bundle, names: Sequence[str], layer: str | None, *, kind: str
         return meant[0]
     stems = Counter(PurePosixPath(name).stem for name in names)
     shown = [
-        PurePosixPath(name).stem if stems[PurePosixPath(name).stem] == 1 else name for name in names
+        PurePosixPath(name).stem if stems[PurePosixPath(name).stem] == 1 else name
+        for name in meant or names
     ]
-    listed = ", ".join(shown[:8]) + (f" and {len(shown) - 8} more" if len(shown) > 8 else "")
+    listed = typed(shown[:8]) + (f" and {len(shown) - 8} more" if len(shown) > 8 else "")
     if not names:
         raise map_error(
             bundle.path, f"it holds no {kind}", fix="name the map's own file",
@@ -436,6 +438,6 @@ def one_of(bundle: Bundle, names: Sequence[str], layer: str | None, *, kind: str
     )
 
 
-def _calls(name: str) -> tuple[str, str, str]:
+def _calls(name: str) -> tuple[str, ...]:
     place = PurePosixPath(name)
-    return place.stem, place.name, name
+    return place.stem, place.name, name, str(place.with_suffix(""))

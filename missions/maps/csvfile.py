@@ -130,7 +130,7 @@ def _grid(table: Table, place: tuple[str, ...], sha256: str) -> Grid:
                 refuse_text(name, table.columns[name], table.path)
         raise map_error(
             table.path,
-            f"no column but those of the place holds numbers{table.example_of(place)}",
+            "no column but those of the place holds numbers",
             fix="add the rates in a column of their own",
             code="no-rate-column",
         )
@@ -364,13 +364,6 @@ class Table:
         """Return the row of the first cell that is not a number, 0 where all are."""
         values = self.columns[name]
         return next((i for i, one in enumerate(values) if not _NUMBER.fullmatch(one.strip())), 0)
-
-    def example_of(self, place: Sequence[str]) -> str:
-        """Return the first cell beside the place in words, with its line; nothing without one."""
-        names = [name for name in self.columns if name not in place]
-        if not names or not self.lines:
-            return ""
-        return f" (line {self.lines[0]}: {names[-1]} is {self.columns[names[-1]][0][:40]!r})"
 
     def refuse_bad_cell(self, name: str) -> None:
         """Refuse a column most of whose cells are numbers, and name the first that is none."""

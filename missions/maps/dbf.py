@@ -10,7 +10,6 @@ from __future__ import annotations
 import codecs
 import re
 import struct
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -18,7 +17,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from companion.wording import counted
-from missions.maps.bundle import Bundle, files_beside, open_bundle
+from missions.maps.bundle import Bundle, files_beside, one_of, open_bundle
 from missions.maps.model import Column, Problem, Value, check_counts, digest, map_error
 
 _HEADER_BYTES = 32
@@ -359,51 +358,10 @@ def _meant(bundle: Bundle, layer: str | None) -> str:
     after prescriptions.
     """
     found = bundle.with_suffix(".shp")
-    if not found:
-        raise map_error(
-            bundle.path,
-            "there is no shapefile (.shp) in it",
-            fix="name the map's file",
-            code="unknown-format",
-        )
-    if layer is not None:
-        meant = [name for name in found if layer in _calls(name)]
-    else:
-        least = min(_depth(name) for name in found)
-        meant = [name for name in found if _depth(name) == least or _in_rx(name)]
-    if len(meant) == 1:
-        return meant[0]
-    names = ", ".join(_shown(meant or found))
-    if not meant:
-        raise map_error(
-            bundle.path,
-            f"it holds no layer {layer!r}, but the shapefiles {names}",
-            fix="name one of them with --layer",
-            code="no-layer",
-        )
-    raise map_error(
-        bundle.path,
-        f"it holds the shapefiles {names}",
-        fix="name one of them with --layer",
-        code="several-layers",
-    )
-
-
-def _calls(name: str) -> tuple[str, str, str]:
-    """Return what a shapefile may be called: by its stem, or by its place."""
-    return PurePosixPath(name).stem, name, str(PurePosixPath(name).with_suffix(""))
-
-
-def _shown(names: Sequence[str]) -> list[str]:
-    """Return stems, and places where stems repeat, as many as a message bears."""
-    stems = Counter(PurePosixPath(name).stem for name in names)
-    shown = [
-        PurePosixPath(name).stem
-        if stems[PurePosixPath(name).stem] == 1
-        else str(PurePosixPath(name).with_suffix(""))
-        for name in names
-    ]
-    return [*shown[:8], f"and {len(shown) - 8} more"] if len(shown) > 8 else shown
+    if layer is None and found:
+        least = min(map(_depth, found))
+        found = [name for name in found if _depth(name) == least or _in_rx(name)]
+    return one_of(bundle, found, layer, kind=".shp")
 
 
 def _depth(name: str) -> int:

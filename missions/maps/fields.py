@@ -32,7 +32,6 @@ from missions.maps.model import (
 from missions.maps.units import (
     RateUnit,
     bare,
-    is_mass_per_area,
     is_volume,
     l_ha_per_unit,
     other_quantity,
@@ -40,7 +39,6 @@ from missions.maps.units import (
     quantity_of_word,
     rate_unit,
     unit_in_name,
-    unit_name,
 )
 
 
@@ -213,10 +211,8 @@ def _candidates(columns: Sequence[Source], path: Path) -> list[Source]:
     unclear: list[Source] = [
         one for one in full if score(one) < NONE and not _RATES.isdisjoint(words(one.name))
     ]
-    if weak and unclear:
-        raise _differ([*unclear, *weak], path)
     if weak:
-        return weak
+        return unclear + weak
     bands: list[Source] = [column for column in columns if isinstance(column, Band)]
     if len(columns) == 1 and bands and not {*words(bands[0].name)} & (_OTHERS | _TOTALS):
         return list(columns)  # a raster of one band is a map of that
@@ -237,7 +233,7 @@ def _candidates(columns: Sequence[Source], path: Path) -> list[Source]:
 _NAME_IT = "name the column with --rate-field (prescription.rate_field)"
 
 
-def refuse_text(name: str, values: Iterable[Value], path: Path, where: str = "") -> None:
+def refuse_text(name: str, values: Iterable[Value], path: Path) -> None:
     """Refuse a column that is called a rate and holds text like `18,5` or `18.5 L/ha`."""
     if score(Column(name=name, values=(), numeric=True)) < NAMED:
         return
@@ -246,7 +242,7 @@ def refuse_text(name: str, values: Iterable[Value], path: Path, where: str = "")
     if re.match(r"[+-]?[\d.,]*\d", text, re.ASCII):
         raise map_error(
             path,
-            f"{where}{name} holds {text[:40]!r}, which is text and not a number",
+            f"{name} holds {text[:40]!r}, which is text and not a number",
             fix="write its rates as numbers like 18.5, with a point and without a unit",
             code="text-rate",
         )
@@ -305,9 +301,16 @@ def _among(candidates: Sequence[Source], path: Path) -> Choice[Source]:
     """Return the one whose values the other candidates repeat, if there is such a one."""
     if len(candidates) == 1:
         return Choice(column=candidates[0])
-    best = next((one for one in candidates if _repeated_by(one, candidates)), None)
+    clear = all(score(one) > NONE for one in candidates)
+    best = next((one for one in candidates if clear and _repeated_by(one, candidates)), None)
     if best is None:
-        raise _differ(candidates, path)
+        names = typed(column.name for column in candidates)
+        raise map_error(
+            path,
+            f"several columns can be the rate and differ: {names}",
+            fix="name one with --rate-field (prescription.rate_field)",
+            code="several-columns",
+        )
     others = ", ".join(column.name for column in candidates if column is not best)
     problem = Problem(
         severity="warning",
@@ -318,16 +321,6 @@ def _among(candidates: Sequence[Source], path: Path) -> Choice[Source]:
         fix=_NAME_IT,
     )
     return Choice(column=best, problems=(problem,))
-
-
-def _differ(candidates: Sequence[Column | Band], path: Path) -> MapError:
-    names = typed(column.name for column in candidates)
-    return map_error(
-        path,
-        f"several columns can be the rate and differ: {names}",
-        fix="name one with --rate-field (prescription.rate_field)",
-        code="several-columns",
-    )
 
 
 def _repeated_by(best: Source, candidates: Sequence[Source]) -> bool:
@@ -391,7 +384,7 @@ def stated_unit(texts: Iterable[str], *, column: str, path: Path) -> str | None:
     True
     """
     texts = [text.strip()[:200] for text in texts]
-    units = {unit for text in texts if (unit := _unit(text)) is not None}
+    units = {unit for text in texts if (unit := unit_in_name(text)) is not None}
     if not units:
         # A quantity that is none of ours, so that nobody takes its numbers for litres.
         units = {found[0] for text in texts if (found := quantity_in_name(text)) is not None}
@@ -403,12 +396,6 @@ def stated_unit(texts: Iterable[str], *, column: str, path: Path) -> str | None:
             code="unit-conflict",
         )
     return next(iter(units), None)
-
-
-def _unit(text: str) -> str | None:
-    if is_mass_per_area(text):
-        return text
-    return unit_name(text) or unit_in_name(text)
 
 
 # ----------------------------------------------------------------------------------------- the unit
@@ -466,7 +453,7 @@ def unit_of(layer: Layer | Grid, rate: Column | Band, *, given: Given, path: Pat
     known = {found.name: found for found in map(rate_unit, declared) if found is not None}
     _refuse_other_quantity(layer, rate, declared, wanted=wanted, known=bool(known), path=path)
     unknown = [text for text in declared if rate_unit(text) is None]
-    if unknown and (wanted is None or any(map(is_mass_per_area, unknown))):
+    if unknown and wanted is None:
         raise _no_unit(f"its unit {unknown[0][:40]!r}", unknown[0], path)
     if len(known) > 1:
         names = ", ".join(sorted(known))
@@ -488,7 +475,16 @@ def unit_of(layer: Layer | Grid, rate: Column | Band, *, given: Given, path: Pat
         raise map_error(
             path, f"no unit is given for the rates in {rate.name}", fix=_FIX, code="no-unit"
         )
-    problems = tuple(_overridden(unknown, found.name, rate))
+    problems = tuple(
+        Problem(
+            severity="warning",
+            code="unit-overridden",
+            text=f"the file's unit {text[:40]!r} is not understood; {found.name} is used",
+            where=rate.name,
+            fix="make sure that it means the same",
+        )
+        for text in unknown[:1]
+    )
     return _in_litres(found, given, path, problems, layer.instead)
 
 
@@ -598,27 +594,13 @@ def _wanted(asked: str, path: Path) -> RateUnit:
 
 def _no_unit(what: str, unit: str, path: Path) -> MapError:
     """Return the refusal of a unit: of something else, or of nothing that is known here."""
-    other = is_volume(unit) or is_mass_per_area(unit) or other_quantity(unit) is not None
+    other = is_volume(unit) or other_quantity(unit) is not None
     return map_error(
         path,
         f"{what} is not a volume per area" if other else f"{what} is none that is known here",
         fix=_FIX,
         code="not-a-volume",
     )
-
-
-def _overridden(unknown: Sequence[str], wanted: str, rate: Column | Band) -> list[Problem]:
-    if not unknown:
-        return []
-    return [
-        Problem(
-            severity="warning",
-            code="unit-overridden",
-            text=f"the file's unit {unknown[0][:40]!r} is not understood; {wanted} is used",
-            where=rate.name,
-            fix="make sure that it means the same",
-        )
-    ]
 
 
 def _declared(layer: Layer | Grid, rate: Column | Band, given: Given, path: Path) -> list[str]:

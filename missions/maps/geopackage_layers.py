@@ -17,6 +17,7 @@ from shapely import GeometryType
 from shapely.errors import ShapelyError
 from shapely.geometry.base import BaseGeometry
 
+from companion.wording import typed
 from missions.maps.fields import column_of
 from missions.maps.local import Area, as_area
 from missions.maps.model import Value, check_coordinates, check_counts, map_error
@@ -125,7 +126,7 @@ def chosen_layer(database: Database, tables: Sequence[LayerTable], layer: str | 
         if len(candidates) > 1:
             candidates = [one for one in candidates if _may_hold_rates(database, one)] or candidates
     if len(candidates) != 1:
-        names = ", ".join(one.name for one in (candidates or tables)[:20])
+        names = typed(one.name for one in (candidates or tables)[:20])
         raise map_error(
             database.path,
             f"there is no layer {layer!r}; the layers are {names}"

@@ -16,7 +16,8 @@ from xml.etree.ElementTree import Element
 from shapely import MultiPolygon, Polygon
 
 from companion.map_formats import KML_HEAD, KML_TAIL, kml_colour, kml_ground, kml_text, zipped
-from missions.maps.bundle import MAX_ELEMENTS, Bundle, open_bundle, parse_xml
+from companion.wording import typed
+from missions.maps.bundle import MAX_ELEMENTS, Bundle, one_of, open_bundle, parse_xml
 from missions.maps.crs import WGS84
 from missions.maps.fields import column_of, stated_unit
 from missions.maps.geopackage_layers import areas_of
@@ -163,7 +164,7 @@ def _inside(
     found = [index for index in chosen if layer in placemarks[index].folders]
     if not found:
         names = dict.fromkeys(name for index in chosen for name in placemarks[index].folders)
-        shown = ", ".join([name for name in names if name][:20]) or "none"
+        shown = typed([name for name in names if name][:20]) or "none"
         raise map_error(
             path,
             f"there is no folder {layer!r}; the folders are {shown}",
@@ -311,7 +312,7 @@ def read_files(path: Path, layer: str | None) -> KmlFiles:
         problems = _problems(sum(1 for _ in _links(root)), path)
         return KmlFiles(root=root, contents=(content,), folder=layer, problems=problems)
     bundle = open_bundle(path)
-    name, used = _main_file(bundle, path, layer)
+    name, used = _main_file(bundle, layer)
     content = bundle.read(name)
     root = parse_xml(content, path, name=name)
     linked, lost = _graft(root, name, bundle, path)
@@ -323,7 +324,7 @@ def read_files(path: Path, layer: str | None) -> KmlFiles:
     )
 
 
-def _main_file(bundle: Bundle, path: Path, layer: str | None) -> tuple[str, bool]:
+def _main_file(bundle: Bundle, layer: str | None) -> tuple[str, bool]:
     """Return the file that is meant, and whether `layer` was needed to say so.
 
     A KMZ archive's own file is `doc.kml` at its top; others beside it are for network links.
@@ -337,15 +338,7 @@ def _main_file(bundle: Bundle, path: Path, layer: str | None) -> tuple[str, bool
         return named[0], True
     if len(meant) == 1:
         return meant[0], False
-    asked = [name for name in names if layer == PurePosixPath(name).stem]
-    if len(asked) == 1:
-        return asked[0], True
-    raise map_error(
-        path,
-        f"it holds the KML files {', '.join(names[:10])}" if names else "it holds no KML file",
-        fix="name one of them with --layer" if names else "name the file of the map itself",
-        code="several-layers" if names else "no-file",
-    )
+    return one_of(bundle, names, layer, kind="KML"), True
 
 
 def _graft(root: Element, name: str, bundle: Bundle, path: Path) -> tuple[list[bytes], int]:

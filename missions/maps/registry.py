@@ -15,6 +15,7 @@ from shapely.geometry.base import BaseGeometry
 
 from companion.core.frame import LocalFrame
 from companion.flight_map import is_flight_map, read_flight_map
+from companion.wording import typed
 from missions.maps.adapt import (
     NAME,
     Operation,
@@ -389,8 +390,8 @@ def _of_package(path: Path, layer: str | None) -> tuple[Reader, str | None]:
     raise map_error(
         path,
         f"it holds maps of several formats: {', '.join(shown)}{none}",
-        fix=f"name one with --layer (prescription.layer), for example --layer {maps[0].name}, or "
-        "give the file itself",
+        fix="name one with --layer (prescription.layer), for example "
+        f"--layer {typed([maps[0].name])}, or give the file itself",
         code="several-layers",
     )
 

@@ -153,18 +153,6 @@ def rate_unit(unit: str) -> RateUnit | None:
     return None
 
 
-def unit_name(unit: str) -> str | None:
-    """Return the unit as this project spells it, or None for what is no volume per area.
-
-    >>> unit_name("l/ha"), unit_name("Litres per hectare"), unit_name("gal1ac-1"), unit_name("gpa")
-    ('L/ha', 'L/ha', 'gal/ac', 'gal/ac')
-    >>> unit_name("kg/ha"), unit_name("L/min"), unit_name("")
-    (None, None, None)
-    """
-    found = rate_unit(unit)
-    return found.name if found is not None and found.kind == "volume" else None
-
-
 def l_ha_per_unit(
     unit: str,
     *,
@@ -211,16 +199,6 @@ def is_volume(unit: str) -> bool:
     return any(re.fullmatch(called, _plain(unit)[:40]) for _, called in _LITRES.values())
 
 
-def is_mass_per_area(unit: str) -> bool:
-    """Tell whether this is a rate of something weighed, which no sprayer map can be.
-
-    >>> is_mass_per_area("kg/ha"), is_mass_per_area("lbs/ac"), is_mass_per_area("L/ha")
-    (True, True, False)
-    """
-    areas = "|".join(areas for _, areas in _HECTARES.values())
-    return re.fullmatch(_ratio(_MASS, areas), _plain(unit)[:40]) is not None
-
-
 def other_quantity(unit: str) -> str | None:
     """Return what a known unit measures that is not a volume per area and cannot become one.
 
@@ -235,6 +213,10 @@ def other_quantity(unit: str) -> str | None:
     if not plain or len(plain) > 40 or rate_unit(unit) is not None:
         return None
     return next((name for name, form in _OTHERS if form.fullmatch(plain)), None)
+
+
+# Of what is no certain weight: tons are of several sizes.
+A_MASS = "a weight per area"
 
 
 def _others() -> tuple[tuple[str, re.Pattern[str]], ...]:
@@ -258,7 +240,8 @@ def _others() -> tuple[tuple[str, re.Pattern[str]], ...]:
         "a weight of a nutrient or an active ingredient": f"(?:{masses}){join}(?:{_PART})"
         f"{per_area}?|(?:{_PART}){join}(?:{masses}){per_area}",
         "a weight per time": f"(?:{masses})(?:/|per)(?:{times})",
-        "a weight": f"(?:{masses}){per_area}?",
+        "a weight": f"(?:{masses})",
+        A_MASS: f"(?:{masses}){per_area}",
         "a yield": f"(?:bu|bushels?|bales?){per_area}?",
         "a speed": r"km/?h|kmh|kph|m/s|mph|kn(?:ots)?",
         "a pressure": r"bar|psi|[kmh]?pa",
@@ -333,7 +316,7 @@ def unit_in_name(column: str) -> str | None:
     """
     for run in _runs(column):
         found = rate_unit(run)
-        if found is None and not is_mass_per_area(run):
+        if found is None and other_quantity(run) != A_MASS:
             continue
         if len(run) > _SHORT + 1 or not run.isalnum() or run.casefold() in _WHOLE:
             return run if found is None else found.name

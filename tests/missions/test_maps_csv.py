@@ -311,7 +311,7 @@ def test_units_are_taken_from_their_columns(folder: Path) -> None:
         ("plot,rate\n1,5\n", "no-coordinates", "plot, rate"),
         ("lat,latitude,rate\n1,5,6\n", "no-coordinates", "no columns say where"),
         ("lat,lon,rate,rate\n36.0,114.5,5,6\n", "duplicate-column", "rate is there 2 times"),
-        (square("lat,lon,crop", "a", "b", "c", "d"), "no-rate-column", "(line 2: crop is 'a')"),
+        (square("lat,lon,crop", "a", "b", "c", "d"), "no-rate-column", "no column but those"),
         ('lat,lon,rate\n36.0,114.5,"5\n', "truncated", "not a whole CSV file"),
         ("lat,lon,rate" + ",a" * 300 + "\n", "too-large", "303 columns"),
     ],

@@ -386,8 +386,8 @@ def test_an_archive_with_several_maps_asks_which(tmp_path: Path) -> None:
     assert refused(path).code == "several-layers"
     assert columns(read_kml(path, "june"))["rate"][0] == ("6",)
     assert columns(read_kml(path, "may.kml"))["rate"][0] == ("5",)
-    assert refused(path, "july").code == "several-layers"
-    assert refused(zipped(tmp_path, {"a.txt": ""})).code == "no-file"
+    assert refused(path, "july").code == "no-layer"
+    assert refused(zipped(tmp_path, {"a.txt": ""})).code == "unknown-format"
 
 
 def links(*targets: str) -> str:

@@ -63,22 +63,22 @@ def rate_of(path: Path, name: str | None = None) -> object:
 @pytest.mark.parametrize("pack", [lambda folder: folder, zipped])
 def test_a_layer_is_chosen_by_stem_or_place(tmp_path: Path, pack: Callable[[Path], Path]) -> None:
     path = pack(two_layers(tmp_path, "Rx/a.shp", "Rx/b.shp"))
-    with pytest.raises(MapError, match="the shapefiles a, b; name one") as caught:
+    with pytest.raises(MapError, match=r"the .shp files a, b; name one") as caught:
         read_shapefile(path)
     assert caught.value.code == "several-layers"
     for name in ("b", "Rx/b", "Rx/b.shp"):
         assert rate_of(path, name) == 2.0
-    with pytest.raises(MapError, match="no layer 'c', but the shapefiles a, b") as caught:
+    with pytest.raises(MapError, match=r"the .shp files a, b, and no 'c'") as caught:
         read_shapefile(path, "c")
     assert caught.value.code == "no-layer"
 
 
 def test_stems_that_repeat_are_told_apart_by_their_place(tmp_path: Path) -> None:
     path = two_layers(tmp_path, "north/rx.shp", "south/rx.shp")
-    with pytest.raises(MapError, match="the shapefiles north/rx, south/rx;") as caught:
+    with pytest.raises(MapError, match=r"the .shp files north/rx.shp, south/rx.shp;") as caught:
         read_shapefile(path)
     assert caught.value.code == "several-layers"
-    with pytest.raises(MapError, match="north/rx, south/rx"):
+    with pytest.raises(MapError, match=r"north/rx.shp, south/rx.shp"):
         read_shapefile(path, "rx")
     assert rate_of(path, "south/rx") == 2.0
 

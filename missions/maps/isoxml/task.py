@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree.ElementTree import Element, tostring
 
+from companion.wording import typed
 from missions.maps.isoxml.values import (
     EXPORT_AGAIN,
     children,
@@ -140,7 +141,7 @@ def chosen_task(
         raise map_error(
             path,
             f"several tasks have a prescription: {task_list(listed)}",
-            fix=f"choose one with --layer, for example --layer {example}",
+            fix=f"choose one with --layer, for example --layer {typed([example])}",
             code="several-layers",
         )
     chosen = ById(root, "TSK", path).get(found[0])
