@@ -58,6 +58,8 @@ _FROM_PROFILE = """\
 # ISO 10625: the first two digits of a size, and tenths behind them, are the flow in tenths of a US
 # gallon a minute at 40 psi (2.76 bar): 015 is 1.5.
 _ISO_L_MIN, _ISO_BAR = 0.37854, 2.758
+# How many, and how far apart: 6 1.0; 8, 0.5; 8 0,5; 8 x 0,5 m.
+_VALVES = re.compile(r"(\d+)\s*[ ,;x]\s*(\d*[.,]?\d+)\s*m?")
 _ISO = re.compile(r"(iso ?)?(\d{1,2})\.?(\d*)(?: ?(?:at|@) ?(\d+(?:\.\d+)?) ?(bar|psi|kpa))?")
 _BAR = {"bar": 1.0, "psi": 0.0689476, "kpa": 0.01}
 FLOWS = "write L/min (0.8), or an ISO size with its pressure (03 at 3 bar, at 40 psi, at 300 kPa)"
@@ -247,14 +249,13 @@ def _outputs(answers: Answers) -> list[str]:
 
 
 def _with_valves(answers: Answers, text: str) -> Answers:
-    # A comma that stands between the two numbers, or in one of them for decimals.
-    words = [word.strip(",") for word in (text.split() if " " in text.strip() else text.split(","))]
-    if len(words) != 2:
-        raise ConfigError(f"{' '.join(words)!r}: write two numbers, such as 6 1.0")
-    count = _number(words[0], "number of valves", 1, VALVES_MAX)
-    if count != int(count):
-        raise ConfigError(f"number of valves {words[0]}: not a whole number")
-    spacing_m = _number(words[1], "spacing", 0.05, 50.0)
+    found = _VALVES.fullmatch(text.strip().lower())
+    if found is None:
+        raise ConfigError(
+            f"{text.strip()!r}: write a whole number and metres, such as 6 1.0 or 8 0,5"
+        )
+    count = _number(found[1], "number of valves", 1, VALVES_MAX)
+    spacing_m = _number(found[2], "spacing", 0.05, 50.0)
     return replace(answers, valves=int(count), spacing_m=spacing_m, swath_m=None)
 
 
@@ -294,7 +295,8 @@ def _with_its_unit(answers: Answers) -> Answers:
 
 
 def _with_swath(answers: Answers, text: str) -> Answers:
-    swath_m, wide_m = _number(text, "swath", 0.1, 100.0), answers.valves * answers.spacing_m
+    swath_m = _number(text.strip().lower().removesuffix("m"), "swath", 0.1, 100.0)
+    wide_m = answers.valves * answers.spacing_m
     # Strips of another width than the spacing would lie over each other, or apart.
     if answers.valves > 1 and abs(swath_m - wide_m) > SWATH_TOLERANCE * wide_m:
         raise ConfigError(

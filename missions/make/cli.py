@@ -66,9 +66,13 @@ from missions.make.zones import Limits, Made, Wish, cells, make_zones, polygons
 from missions.maps.convert.formats import writer_for
 from missions.maps.model import MapFile, check_folder, digest, map_error, read_bytes
 
+ZONES_EXAMPLE = (
+    "vrspray make zones ndvi.tif --value NDVI --boundary field.geojson --config field.toml "
+    "--rates 24,18,12 --out field.gpkg"
+)
 app = new_app(
     no_args_is_help=True, help="Make prescriptions from a field's data.",
-    epilog="Example: vrspray make zones ndvi.tif --value NDVI --out field.gpkg",
+    epilog=f"Example: {ZONES_EXAMPLE}",
 )  # fmt: skip
 
 BAR_AFTER_S = 2.0
@@ -83,10 +87,7 @@ def _make() -> None:
     """Make prescriptions from a field's data."""
 
 
-@app.command(
-    epilog="Example: vrspray make zones ndvi.tif --value NDVI --boundary field.geojson "
-    "--config field.toml --rates 24,18,12 --out field.gpkg"
-)
+@app.command(epilog=f"Example: {ZONES_EXAMPLE}")
 def zones(
     data: Annotated[
         list[Path], typer.Argument(metavar="DATA...", help="Raster, points or polygons.")

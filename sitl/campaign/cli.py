@@ -43,7 +43,7 @@ class RunIsUnsaid(TyperGroup):
 app = new_app(
     cls=RunIsUnsaid,
     help="Simulate many flights, varying settings: vrspray campaign FILE. Show the results.",
-    epilog="Example: vrspray campaign lags.toml --out lags && vrspray campaign show lags",
+    epilog="Example: vrspray campaign examples/campaigns/lags.toml --out lags",
     no_args_is_help=True,
 )
 

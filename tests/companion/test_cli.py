@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import importlib
 import os
+import re
+import shlex
 import shutil
 import signal
 import socket
@@ -287,6 +289,32 @@ def test_command_that_is_not_installed_says_so() -> None:
 def test_command_has_help_with_an_example(name: str, capsys: Captured) -> None:
     assert execute([name, "--help"]) == 0
     assert f"vrspray {name}" in capsys.readouterr().out.partition("Example:")[2]
+
+
+def examples_of(command: Any) -> Iterator[str]:
+    for text in (command.epilog or "", command.help or ""):
+        for found in re.findall(r"Example: (.*?)(?=Example:|\n\n|$)", text, re.DOTALL):
+            yield " ".join(found.split())
+    if hasattr(command, "list_commands"):
+        context = command.make_context("vrspray", [], resilient_parsing=True)
+        for name in command.list_commands(context):
+            yield from examples_of(command.get_command(context, name))
+
+
+def test_every_example_of_the_help_has_all_that_its_command_wants() -> None:
+    whole = typer.main.get_command(app)
+    examples = list(examples_of(whole))
+    assert len(examples) > 60
+    for example in examples:
+        words = shlex.split(example.removeprefix("sudo ").partition(" > ")[0])
+        command, context = whole, None
+        args = words[1:]
+        while hasattr(command, "list_commands"):
+            context = command.make_context("x", list(args), parent=context)
+            _, command, args = command.resolve_command(
+                context, [*context._protected_args, *context.args]
+            )
+        command.make_context("x", list(args), parent=context)  # or says what is missing
 
 
 @pytest.mark.parametrize("name", ["config check", "config show", "config schema"])

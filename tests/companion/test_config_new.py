@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from companion.cli.app import app, execute
-from companion.cli.new_config import Answers, nozzle_flow, text_of
+from companion.cli.new_config import Answers, _with_swath, _with_valves, nozzle_flow, text_of
 from companion.config import load
 from companion.errors import ConfigError
 
@@ -288,6 +288,18 @@ def test_a_map_without_a_unit_needs_one(
     done = CliRunner().invoke(app, asking, input=told)
     assert (done.exit_code, done.output.count("does not say the unit")) == (0, 1)
     assert load(out).prescription.unit == "L/ha"  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("text", ["8 0.5", "8 0,5", "8, 0.5", "8,0.5", "8;0,5 m", "8 x 0,5m"])
+def test_valves_and_spacing_are_understood_as_people_write_them(text: str) -> None:
+    found = _with_swath(_with_valves(Answers(), text), "4,0 m")
+    assert (found.valves, found.spacing_m, found.swath_m) == (8, 0.5, 4.0)
+
+
+@pytest.mark.parametrize("text", ["8", "8.5 1", "eight 1", "8 1 2", "-8 1", "8 nan"])
+def test_a_refusal_of_valves_repeats_the_forms(text: str) -> None:
+    with pytest.raises(ConfigError, match=r"such as 6 1\.0 or 8 0,5"):
+        _with_valves(Answers(), text)
 
 
 @pytest.mark.parametrize(

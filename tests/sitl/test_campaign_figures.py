@@ -258,6 +258,18 @@ def test_what_is_no_table_is_refused(out: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "table.xlsx").exists()
 
 
+def test_a_table_that_is_there_is_kept_unless_forced(out: Path, tmp_path: Path) -> None:
+    words = ["show", str(out), "--figure", FIGURE, "--out", str(tmp_path / "table.csv")]
+    (tmp_path / "table.csv").write_text("mine")
+    answer = CliRunner().invoke(cli.app, words)
+    assert "is there already; give another --out, or --force" in str(answer.exception)
+    assert (tmp_path / "table.csv").read_text() == "mine"
+    answer = CliRunner().invoke(cli.app, [*words, "--force"])
+    assert (answer.exit_code, (tmp_path / "table.csv").read_text() != "mine") == (0, True)
+    # As `--figure` names it.
+    assert FIGURE in answer.stdout
+
+
 def test_the_terminal_says_what_intervals_are_over(out: Path) -> None:
     answer = CliRunner().invoke(cli.app, ["show", str(out), "--figure", FIGURE])
     lines = answer.stdout.splitlines()

@@ -307,8 +307,8 @@ INTRODUCTION = """\
 
 # Validation against Wang et al. 2024
 
-The emulated controller of the paper (P1) and ours fly P1's field on the simulated sprayer, beside
-P1's published figures; [accuracy](../explanation/accuracy.md) says what agrees and what does not.
+The emulated controller of Wang et al. 2024 (P1) and ours fly P1's field on the simulated sprayer,
+beside P1's published figures; [accuracy](../explanation/accuracy.md) says what agrees and what not.
 """
 
 LAG_TEXT = """\
