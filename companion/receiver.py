@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from operator import itemgetter
 
+from companion.core.frame import METRES_PER_DEGREE
 from companion.core.types import Fix, GnssReport, Input, Telemetry
 
 # Receivers are rarely earlier or later, and an estimate farther from one (from RTK) is at fault.
@@ -27,7 +28,6 @@ TOLD_KEPT = 50
 GAP_MAX_S = 1.5
 # At 5 Hz a vehicle in flight remembers two minutes.
 MEMORY_FIXES = 600.0
-M_PER_DEG = 111_195.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,7 +107,7 @@ class ReceiverWatch:
             if before_s <= at_s < after_s <= before_s + GAP_MAX_S:
                 part = (at_s - before_s) / (after_s - before_s)
                 move += part * (next_move - move)
-                off = M_PER_DEG * (place + part * (next_place - place) - fixed)
+                off = METRES_PER_DEGREE * (place + part * (next_place - place) - fixed)
                 off = complex(off.real * math.cos(math.radians(fixed.imag)), off.imag)
                 more = 1.0, move, abs(move) ** 2, off, (move.conjugate() * off).real
                 sums = self._sums[abs(move) > MOVING_M_S]

@@ -14,7 +14,7 @@ import shapely
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 
-from companion.core.frame import LocalFrame
+from companion.core.frame import METRES_PER_DEGREE, LocalFrame
 from missions.errors import PlanError
 from missions.field import Field
 from missions.maps.bundle import files_beside
@@ -98,7 +98,7 @@ class Dem:
         cells = min(float(np.hypot(a, d)), float(np.hypot(b, e)))
         if self.crs.is_geographic:
             shrunk = float(np.cos(np.radians(frame.latitude_deg)))
-            cells *= 111_000.0 * max(shrunk, 0.05)
+            cells *= METRES_PER_DEGREE * max(shrunk, 0.05)
         else:
             cells *= self.crs.axis_info[0].unit_conversion_factor or 1.0
         return min(max(cells / 2.0, 1.0), 15.0)

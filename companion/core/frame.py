@@ -28,6 +28,10 @@ PlainEdge = tuple[float, float, float, float, int]
 Offset = tuple[float, float]
 
 WGS84 = Geod(ellps="WGS84")
+# Of WGS84: half axis [m] and square of the eccentricity.
+_HALF_AXIS_M, _ECCENTRICITY_2 = 6_378_137.0, 6.694379990141e-3
+# To 0.6 % everywhere, of latitude.
+METRES_PER_DEGREE = 111_320.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,3 +119,16 @@ def course_deg(velocity_east_m_s: float, velocity_north_m_s: float) -> float:
     90.0
     """
     return math.degrees(math.atan2(velocity_east_m_s, velocity_north_m_s)) % 360.0
+
+
+def metres_per_degree(latitude_deg: float) -> tuple[float, float]:
+    """Return the length of a degree of longitude and of one of latitude on WGS84.
+
+    >>> [round(value, 1) for value in metres_per_degree(45.0)]
+    [78846.8, 111131.8]
+    """
+    latitude = math.radians(latitude_deg)
+    root = math.sqrt(1.0 - _ECCENTRICITY_2 * math.sin(latitude) ** 2)
+    across_m = _HALF_AXIS_M / root * math.cos(latitude)
+    along_m = _HALF_AXIS_M * (1.0 - _ECCENTRICITY_2) / root**3
+    return math.radians(across_m), math.radians(along_m)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 
+from companion.core.frame import METRES_PER_DEGREE
 from companion.core.types import LegReport
 from companion.link.census import AUTOPILOT_COMPONENT
 from companion.link.encode import Encoder
@@ -310,7 +311,6 @@ _STOPS_FROM_DEG = 60.0
 # of that: two over the same line, there and back, are none the other's part.
 _ON_M = 0.5
 _LONGER_M = 1.0
-_DEG_M = 111_320.0  # a degree of latitude, to 0.6 % everywhere
 
 Place = tuple[float, float]
 
@@ -345,13 +345,13 @@ def _longer(items: Sequence[MissionItem], start: Place, end: Place) -> tuple[Pla
 
     In metres on a plane about `start`: legs are short beside the Earth.
     """
-    east_deg_m = _DEG_M * math.cos(math.radians(start[0]))
-    end_m = ((end[1] - start[1]) * east_deg_m, (end[0] - start[0]) * _DEG_M)
+    east_deg_m = METRES_PER_DEGREE * math.cos(math.radians(start[0]))
+    end_m = ((end[1] - start[1]) * east_deg_m, (end[0] - start[0]) * METRES_PER_DEGREE)
     least_m = math.hypot(*end_m) + _LONGER_M
     found: tuple[float, tuple[Place, Place]] | None = None
     for before, after in _legs(items):
-        x0, y0 = (before[1] - start[1]) * east_deg_m, (before[0] - start[0]) * _DEG_M
-        x1, y1 = (after[1] - start[1]) * east_deg_m, (after[0] - start[0]) * _DEG_M
+        x0, y0 = (before[1] - start[1]) * east_deg_m, (before[0] - start[0]) * METRES_PER_DEGREE
+        x1, y1 = (after[1] - start[1]) * east_deg_m, (after[0] - start[0]) * METRES_PER_DEGREE
         length_m = math.hypot(x1 - x0, y1 - y0)
         if not length_m >= least_m or (found is not None and length_m >= found[0]):
             continue

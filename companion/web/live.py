@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from companion.core.boom import body_axes
+from companion.core.frame import metres_per_degree
 from companion.core.options.coverage import Coverage, Quad
 from companion.core.types import Inhibit, SprayerState
 
@@ -207,10 +208,6 @@ def _end(point: list[Any], right_m: float, forward_m: float) -> tuple[float, flo
     )
 
 
-# WGS84.
-_A_M, _E2 = 6378137.0, 0.00669437999014
-
-
 # A browser takes over what its worker has read in one go: of more zones it would stand still.
 ZONES_AT_ONCE = 4000
 
@@ -228,10 +225,7 @@ def map_parts(ground: dict[str, Any]) -> tuple[dict[str, Any], list[Any], list[d
         ground["origin"]["latitude_deg"],
         ground["origin"]["longitude_deg"],
     )
-    sin, cos = math.sin(math.radians(latitude_deg)), math.cos(math.radians(latitude_deg))
-    w = math.sqrt(1.0 - _E2 * sin * sin)
-    m_per_latitude = math.radians(_A_M * (1.0 - _E2) / w**3)
-    m_per_longitude = math.radians(_A_M * cos / w)
+    m_per_longitude, m_per_latitude = metres_per_degree(latitude_deg)
 
     def places(ring: list[float]) -> list[list[float]]:
         found = [

@@ -17,7 +17,7 @@ import numpy as np
 import shapely
 from pyproj import CRS, Transformer
 
-from companion.core.frame import LocalFrame
+from companion.core.frame import METRES_PER_DEGREE, LocalFrame
 from companion.csv_table import csv_text
 from companion.errors import MapError
 from companion.map_formats import geojson_feature, geojson_text
@@ -232,7 +232,7 @@ def _cell_m(transform: Affine, crs: CRS, frame: LocalFrame) -> float:
     a, b, _, d, e, _ = transform
     size = abs(a * e - b * d)
     if crs.is_geographic:
-        return float(111_320.0 * np.sqrt(size * np.cos(np.radians(frame.latitude_deg))))
+        return float(METRES_PER_DEGREE * np.sqrt(size * np.cos(np.radians(frame.latitude_deg))))
     return float(np.sqrt(size)) * float(crs.axis_info[0].unit_conversion_factor or 1.0)
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
+from companion.core.frame import METRES_PER_DEGREE
 from companion.errors import MapError
 from missions.maps.model import MAX_VERTICES, Problem, Stated, map_error
 
@@ -221,7 +222,6 @@ def _with_long_edges(geometries: Objects, step: float, path: Path | None) -> Ind
 WGS84 = CRS.from_epsg(4326)
 _Box = tuple[float, float, float, float]
 
-METRES_PER_DEGREE = 111_320.0
 # A prescription is one field or a few. Beyond this the local frame is off by more than 4 cm
 # (its scale error is x^2 / (2 R^2)), and a stray vertex is likelier than a field of that size.
 EXTENT_MAX_M = 100_000.0

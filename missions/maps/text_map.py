@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from pyproj import CRS
 
-from companion.core.frame import LocalFrame
+from companion.core.frame import METRES_PER_DEGREE, LocalFrame
 from missions.maps.crs import EXTENT_MAX_M
 from missions.maps.model import Affine, Band, Floats, Grid, Problem, digest, map_error, read_bytes
 from missions.maps.text_lattice import (
@@ -220,7 +220,7 @@ def grid_problems(grid: PointGrid, content: bytes, path: Path) -> list[Problem]:
         )
     decimals = _decimals(content)
     if decimals < DECIMALS_MIN:
-        step_m = float(f"{111_320.0 / 10**decimals:.2g}")
+        step_m = float(f"{METRES_PER_DEGREE / 10**decimals:.2g}")
         found.append(
             (
                 "coarse-position",

@@ -11,11 +11,12 @@ from types import SimpleNamespace
 import pytest
 
 from companion.cli.web_parts import watched as watched_by
+from companion.core.frame import METRES_PER_DEGREE
 from companion.core.types import Fix, GnssReport, Input, SpeedReport, Telemetry
-from companion.receiver import M_PER_DEG, ReceiverOffset, ReceiverWatch
+from companion.receiver import ReceiverOffset, ReceiverWatch
 
 LATITUDE_DEG = 50.0
-EAST_M_PER_DEG = M_PER_DEG * math.cos(math.radians(LATITUDE_DEG))
+EAST_M_PER_DEG = METRES_PER_DEGREE * math.cos(math.radians(LATITUDE_DEG))
 
 
 def position(boot_s: float, east_m: float, east_m_s: float) -> Telemetry:
@@ -37,7 +38,7 @@ def fix(boot_s: float, east_m: float, north_m: float = 0.0) -> GnssReport:
         received_s=boot_s + 40.1,
         fix=Fix.RTK_FIXED,
         boot_s=boot_s,
-        latitude_deg=LATITUDE_DEG + north_m / M_PER_DEG,
+        latitude_deg=LATITUDE_DEG + north_m / METRES_PER_DEGREE,
         longitude_deg=7.0 + east_m / EAST_M_PER_DEG,
     )
 

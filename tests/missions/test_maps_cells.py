@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from shapely import MultiPolygon, Polygon, box
 
+from companion.core.frame import metres_per_degree
 from companion.errors import MapError
 from missions.maps.convert import cell_zones, rasterise
 from missions.maps.convert.cell_zones import outline_of_rates, plain_zones, zones_of
-from missions.maps.convert.rasterise import cell_rates, cells_of, metres_per_degree, north_up
+from missions.maps.convert.rasterise import cell_rates, cells_of, north_up
 from missions.maps.model import Affine, MapCells, MapFile, MapZone
 from missions.maps.totals import as_sprayed, totals
 

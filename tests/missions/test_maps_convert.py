@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from pyproj import CRS
 from shapely import MultiPolygon, Polygon, box
 
+from companion.core.frame import metres_per_degree
 from companion.errors import MapError
 from missions.maps.convert.compare import centres, compare, rates_at, sample_places
 from missions.maps.convert.formats import WRITERS, write_map, writer_for
-from missions.maps.convert.rasterise import metres_per_degree
 from missions.maps.model import MapCells, MapFile, MapZone
 from missions.maps.registry import read_map
 

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from pyproj import CRS
 from shapely import MultiPolygon, Polygon, box
 
+from companion.core.frame import metres_per_degree
 from companion.errors import MapError
 from companion.map_pictures import scale_length_m
 from missions.maps.build import frame_for
-from missions.maps.convert.rasterise import metres_per_degree
 from missions.maps.model import MapCells, MapFile, MapZone
 from missions.maps.picture import DPI, _bounds_m, draw, printable, sheet_for
 from missions.maps.picture_ground import Colours

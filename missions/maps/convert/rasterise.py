@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from shapely import MultiPolygon
 
+from companion.core.frame import metres_per_degree
 from missions.maps.build import frame_for
 from missions.maps.cells import bounds_deg, cell_size_m, numbered
 from missions.maps.crs import WGS84
@@ -30,21 +31,6 @@ MAX_CELLS = 16_000_000
 REMADE_CELLS = 2_000_000
 CELL_MIN_M, CELL_MAX_M = 0.05, 1000.0
 _BITE = 500_000
-# Of WGS84: half axis [m] and square of the eccentricity.
-_HALF_AXIS_M, _ECCENTRICITY_2 = 6_378_137.0, 6.694379990141e-3
-
-
-def metres_per_degree(latitude_deg: float) -> tuple[float, float]:
-    """Return the length of a degree of longitude and of one of latitude on WGS84.
-
-    >>> [round(value, 1) for value in metres_per_degree(45.0)]
-    [78846.8, 111131.8]
-    """
-    latitude = math.radians(latitude_deg)
-    root = math.sqrt(1.0 - _ECCENTRICITY_2 * math.sin(latitude) ** 2)
-    across_m = _HALF_AXIS_M / root * math.cos(latitude)
-    along_m = _HALF_AXIS_M * (1.0 - _ECCENTRICITY_2) / root**3
-    return math.radians(across_m), math.radians(along_m)
 
 
 def cells_of(
