@@ -91,7 +91,6 @@ def p1_lag_distance_m(method: str, speed_m_s: float) -> P1LagDistance | None:
 
 # Beyond this share of the flow, law and table are said to disagree.
 DISAGREE_FROM = 0.03
-SET_NAME = "wang-2024"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

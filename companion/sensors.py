@@ -129,7 +129,6 @@ class PulseCounter:
         self.meter = meter
         self.count = 0
         self.lost_count = 0
-        self.echo_count = 0
         self._edges: deque[tuple[float, int]] = deque()  # time, count with it
         self._echoes: deque[float] = deque(maxlen=ECHOES_KEPT)
         self._number: int | None = None
@@ -150,7 +149,6 @@ class PulseCounter:
             self._lost_s = at_s
             self._is_loss_told = False
         if self._edges and not at_s - self._edges[-1][0] >= ECHO_SHARE * self.meter.period_min_s:
-            self.echo_count += 1
             self._echoes.append(at_s)
             return
         self.count += 1

@@ -15,8 +15,6 @@ from missions.surroundings import NOTHING_AROUND, Surroundings
 
 # What is offered where nothing is asked for: 1 % of the ground, 5 % of the litres.
 LEAVE_MAX_PERCENT, OVERLAP_MAX_PERCENT = 1.0, 5.0
-# Ground under two passes is worth a word from this part of what is covered on.
-TWICE_SHARE = 0.02
 # A smaller gain is not worth a line of text.
 LEAST_S, LEAST_L_PERCENT = 6.0, 1.0
 

@@ -239,7 +239,6 @@ class Ticked(NamedTuple):
     """
 
     clock: Clock
-    is_synced: bool
     moved_s: float
     is_set: bool = False
     is_refused: bool = False
@@ -269,7 +268,7 @@ def tick(
         moved_s = 0.0
         if before is not None and clock.heard_count == 1 and not is_set:
             moved_s = clock.offset_s - before.offset_s - before.rate * passed_s
-        return Ticked(clock, False, moved_s, is_set, is_refused)
+        return Ticked(clock, moved_s, is_set, is_refused)
     assert clock.exchanges is not None
     rate = clock.exchanges.rate(clock.rate, RATE_BY_ARRIVALS_SD)
     wanted_s = min(clock.exchanges.at(now_s, rate), clock.offset_s)
@@ -281,7 +280,7 @@ def tick(
             used_s = known_s + min(max(wanted_s - known_s, -reach_s), reach_s)
         moved_s = used_s - known_s
     clock = clock._replace(delay_s=clock.offset_s - used_s, rate=rate)
-    return Ticked(clock, True, moved_s, is_set, is_refused)
+    return Ticked(clock, moved_s, is_set, is_refused)
 
 
 def _has_exchanges(report: ClockReport | None, clock: Clock, now_s: float) -> bool:

@@ -38,7 +38,6 @@ _MAGIC = 0x377F0682  # its last bit: the words of the check sums are big-endian
 _VERSION = 3_007_000
 _HEADER = struct.Struct(">IIIIIIII")
 _FRAME = struct.Struct(">IIIIII")
-_PAGE_BYTES = frozenset(2**power for power in range(9, 17))
 _WORD = 0xFFFFFFFF
 
 Sums = tuple[int, int]

@@ -83,7 +83,6 @@ class ServoExecutor(TimedExecutor):
         self._was_started = False
         self.order_count = 0
         self.unsent_count = 0
-        self.ack_count = 0
 
     @property
     def fault(self) -> str | None:
@@ -118,7 +117,6 @@ class ServoExecutor(TimedExecutor):
 
         It does not say which of several orders it means, so all valves close.
         """
-        self.ack_count += 1
         before = self.fault
         self._guard.acknowledge(result)
         self._close_if_new(before)
