@@ -9,6 +9,7 @@ import numpy as np
 
 from analysis.csv_rows import TableError
 from analysis.swath import lanes
+from companion.wording import writing
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -272,7 +273,5 @@ def _figure(path: Path, height_in: float = 4.2) -> Iterator[Figure]:
         figure = Figure(figsize=(6.4, height_in), layout="constrained")
         FigureCanvasAgg(figure)
         yield figure
-        try:
+        with writing(f"{path}"):
             figure.savefig(path, dpi=DPI, facecolor="white", metadata={"Software": None})
-        except OSError as error:
-            raise TableError(f"{path}: cannot be written ({error.strerror or error})") from None

@@ -18,7 +18,7 @@ from companion.atomic_write import write_atomically
 from companion.cli.answer import AsJson, answer, new_app, note
 from companion.csv_table import csv_of
 from companion.errors import VrsprayError
-from companion.wording import counted, missing
+from companion.wording import counted, missing, writing
 
 if TYPE_CHECKING:
     from analysis.strips import Strip
@@ -362,10 +362,8 @@ def _line(one: Achieved, half: float) -> str:
 
 def _write_table(path: Path, rows: Sequence[dict[str, Any]]) -> None:
     text = csv_of([{**row, "failed": "; ".join(row["failed"])} for row in rows])
-    try:
+    with writing(f"{path}"):
         write_atomically(path, text.encode())
-    except OSError as error:
-        raise TrialError(f"{path}: cannot be written ({error.strerror or error})") from None
 
 
 # What the program's own command line takes in: one command of the kind that Typer makes.

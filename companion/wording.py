@@ -7,7 +7,8 @@ import re
 import shlex
 import sys
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePath
 from typing import Any, Literal
 
@@ -108,6 +109,18 @@ def refuse_existing(path: Path, *, force: bool, option: str = "--out") -> None:
         raise ConfigError(
             f"{path}: is there already; give another {option}, or --force to replace it"
         )
+
+
+@contextmanager
+def writing(named: str) -> Iterator[None]:
+    """Say in one line that a file or folder cannot be written; `named` is which."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or error
+        raise ConfigError(
+            f"{named}: cannot be written ({reason}); check folder, rights and space"
+        ) from error
 
 
 def read_toml(path: Path, *, what: str, named: str = "") -> tuple[str, dict[str, Any]]:

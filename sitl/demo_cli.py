@@ -23,8 +23,7 @@ from rich.table import Table
 
 from companion.cli.answer import AsJson, answer, new_app, note, progress
 from companion.cli.terminal import terminal, visible
-from companion.errors import ConfigError
-from companion.wording import missing
+from companion.wording import missing, writing
 from sitl.cli import FlowLaw
 from sitl.workers import termination_as_interrupt
 
@@ -130,13 +129,9 @@ def _flown(options: DemoOptions, stage: Path, *, quiet: bool) -> DemoResult:
 def _staging(out: Path) -> Iterator[Path]:
     """Yield a folder inside `out` that is gone afterwards: there is all of a demo or nothing."""
     is_new = not out.exists()
-    try:
+    with writing(f"--out {out}"):
         out.mkdir(parents=True, exist_ok=True)
         stage = Path(tempfile.mkdtemp(prefix=".demo-", dir=out))
-    except OSError as error:
-        raise ConfigError(
-            f"--out {out}: cannot be written ({error.strerror}); give a folder that can"
-        ) from error
     try:
         yield stage
     finally:
@@ -169,7 +164,7 @@ def _write(result: DemoResult, found: dict[str, Any], stage: Path) -> list[str]:
 
 def _move(names: Sequence[str], stage: Path, out: Path) -> None:
     """Put the files in their place, and take away those of an earlier demo that have no new one."""
-    try:
+    with writing(f"--out {out}"):
         for name in FILES:
             if name == FLIGHT_REPORT and (out / name).is_dir():
                 shutil.rmtree(out / name)
@@ -177,10 +172,6 @@ def _move(names: Sequence[str], stage: Path, out: Path) -> None:
                 (stage / name).replace(out / name)
             else:
                 (out / name).unlink(missing_ok=True)
-    except OSError as error:
-        raise ConfigError(
-            f"--out {out}: cannot be written ({error.strerror}); give a folder that can"
-        ) from error
 
 
 # ---------------------------------------------------------------------------------------- the table

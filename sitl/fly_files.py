@@ -11,11 +11,10 @@ import numpy as np
 
 from analysis.strips import strips_of
 from companion.core.types import Decision
-from companion.errors import ConfigError
 from companion.journal.journal import Journal
 from companion.map_pictures import RATES_MAP, rate_ends
 from companion.simulated import SIMULATED, Simulated
-from companion.wording import missing
+from companion.wording import missing, writing
 from missions.maps.compiling import MapOrder, job_of
 from sitl.deposit import Deposit
 
@@ -45,15 +44,12 @@ def write_result(
 ) -> list[Path]:
     """Write results into a folder, which is made, beside the truth; return the files."""
     files = [folder / "truth.npz"] * bool(truth) + [folder / "result.json"]
-    try:
+    with writing(f"--out {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
         if truth:
             np.savez_compressed(files[0], **truth)
         text = json.dumps(result, indent=1, allow_nan=False)
         files[-1].write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise ConfigError(f"--out {folder}: cannot be written ({reason})") from error
     return files
 
 

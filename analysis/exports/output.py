@@ -17,7 +17,7 @@ import shapely
 from numpy.typing import NDArray
 
 from companion.errors import VrsprayError
-from companion.wording import refuse_existing
+from companion.wording import refuse_existing, writing
 
 if TYPE_CHECKING:
     from shapely import MultiPolygon, Polygon
@@ -50,12 +50,12 @@ def write_beside(out: Path, content: Content, *, force: bool) -> int:
     for name in content:
         if (out.parent / name).is_dir():
             raise ExportError(f"{out.parent / name}: is a folder; give another name")
-    try:
-        with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as folder:
-            size = _write(Path(folder), content)
-            _exchange(Path(folder), out.parent, list(content))
-    except OSError as error:
-        raise _not_written(out, error) from None
+    with (
+        writing(f"{out}"),
+        tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as folder,
+    ):
+        size = _write(Path(folder), content)
+        _exchange(Path(folder), out.parent, list(content))
     return size
 
 
@@ -64,14 +64,14 @@ def write_folder(out: Path, content: Content, *, force: bool) -> int:
     check_free(out, [out.name], force=force)
     if out.exists() and not _is_ours(out, content):
         raise ExportError(f"{out}: holds other files; give a folder that is not there yet")
-    try:
-        with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as folder:
-            fresh = Path(folder) / "fresh"
-            fresh.mkdir()
-            size = _write(fresh, content)
-            _exchange_folder(fresh, out, Path(folder) / "replaced")
-    except OSError as error:
-        raise _not_written(out, error) from None
+    with (
+        writing(f"{out}"),
+        tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as folder,
+    ):
+        fresh = Path(folder) / "fresh"
+        fresh.mkdir()
+        size = _write(fresh, content)
+        _exchange_folder(fresh, out, Path(folder) / "replaced")
     return size
 
 
@@ -126,12 +126,6 @@ def _write(folder: Path, content: Content) -> int:
             file.flush()
             os.fsync(file.fileno())  # before the name that makes it count
     return size
-
-
-def _not_written(out: Path, error: OSError) -> ExportError:
-    return ExportError(
-        f"{out}: cannot be written ({error.strerror or error}); check folder, rights and space"
-    )
 
 
 # From the flight's own frame to longitude and latitude, for whole geometries.

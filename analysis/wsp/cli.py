@@ -45,6 +45,7 @@ from analysis.wsp.stains import SPREADS, THRESHOLD, Threshold, spread_of
 from companion.atomic_write import write_atomically
 from companion.cli.answer import AsJson, answer, new_app, note
 from companion.errors import ConfigError, JournalError
+from companion.wording import writing
 
 if TYPE_CHECKING:
     from analysis.flown.applied_flight import AppliedFlight
@@ -165,12 +166,10 @@ def _read_all(
 
 
 def _written(path: Path, draw: Callable[[Path], None]) -> None:
-    try:
+    with writing(f"--out {path}"):
         # Not before there is something to write: what is refused leaves no folder.
         path.parent.mkdir(parents=True, exist_ok=True)
         draw(path)
-    except OSError as error:
-        raise ConfigError(f"--out: {path} cannot be written ({error.strerror or error})") from error
 
 
 def _ties(

@@ -13,15 +13,10 @@ import numpy as np
 import typer
 
 from companion.cli.answer import (
-    AsJson,
-    Overrides,
-    answer,
     new_app,
-    note_problems,
     problem_object,
     progress,
 )
-from companion.config import load
 from companion.errors import Problem
 from companion.flight_map import is_flight_map
 from companion.wording import counted, lack_of, refuse_existing
@@ -40,31 +35,20 @@ from missions.make.data import (
 )
 from missions.make.flown import (
     MARGIN,
-    Boundary,
-    ConfigFile,
-    CourseDeg,
     FlownField,
-    FormatName,
+    Making,
     Margin,
-    NoSpray,
-    OutFile,
-    Picture,
-    bounded,
     check_rate,
-    draw_picture,
-    flown_field,
     limits_of,
-    map_target,
+    making,
     numbers,
     problems_of,
-    written,
 )
 from missions.make.passes import Places, places_in
 from missions.make.spots_cli import spots
 from missions.make.trial import trial
 from missions.make.zones import Limits, Made, Wish, cells, make_zones, polygons
-from missions.maps.convert.formats import writer_for
-from missions.maps.model import MapFile, check_folder, digest, map_error, read_bytes
+from missions.maps.model import MapFile, digest, map_error, read_bytes
 
 ZONES_EXAMPLE = (
     "vrspray make zones ndvi.tif --value NDVI --boundary field.geojson --config field.toml "
@@ -88,12 +72,12 @@ def _make() -> None:
 
 
 @app.command(epilog=f"Example: {ZONES_EXAMPLE}")
+@making
 def zones(
     data: Annotated[
         list[Path], typer.Argument(metavar="DATA...", help="Raster, points or polygons.")
     ],
-    out: OutFile,
-    config_file: ConfigFile,
+    making: Making,
     rates: Annotated[
         str | None,
         typer.Option(metavar="R,R,...", help="L/ha of each zone, lowest values first."),
@@ -129,9 +113,6 @@ def zones(
     band_offset: Annotated[
         float, typer.Option(metavar="D", help="Added to bands; Sentinel-2 since 2022: -1000.")
     ] = 0.0,
-    boundary: Boundary = None,
-    no_spray: NoSpray = None,
-    angle_deg: CourseDeg = None,
     smooth_m: Annotated[
         float,
         typer.Option(
@@ -176,11 +157,6 @@ def zones(
     layer: Annotated[
         str | None, typer.Option(metavar="L", help="Layer of DATA, where there are several.")
     ] = None,
-    png: Picture = None,
-    format_name: FormatName = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing map.")] = False,
-    overrides: Overrides = None,
-    as_json: AsJson = False,
 ) -> None:
     """Make zones that the sprayer can follow; say what that costs.
 
@@ -189,15 +165,11 @@ def zones(
     if importlib.util.find_spec("scipy") is None:
         text, fix = lack_of("scipy")
         raise map_error(data[0], text, fix=fix, code="missing-library")
-    config = bounded(load(config_file, overrides=overrides or ()), boundary)
+    config = making.config(cleaned)
     wish = _wish(rates, law, litres_max, count, method, smooth_m, step_percent)
-    if as_is and is_flight_map(out):
+    if as_is and is_flight_map(making.out):
         raise typer.BadParameter("--as-is makes a map to compare, not to fly: name another format")
-    target = map_target(out)
-    writer = writer_for(target, format_name)
-    for path in (out, *(one for one in (png, cleaned) if one is not None)):
-        check_folder(path)
-    _check_cleaned(cleaned, data, force=force)
+    _check_cleaned(cleaned, data, force=making.force)
     wanted = _wanted(
         data, value or [],
         Wanted(
@@ -207,7 +179,7 @@ def zones(
     )  # fmt: skip
     with progress(after_s=BAR_AFTER_S) as tell:
         tell("planning the passes", 0, 4)
-        field = flown_field(config, no_spray or [], angle_deg, across)
+        field = making.field(config, across)
         tell("reading the data", 1, 4)
         read = [read_values(path, one, field.frame) for path, one in zip(data, wanted, strict=True)]
         points = _points_of(read, data) if cleaned is not None else None
@@ -216,7 +188,7 @@ def zones(
             if limits is not None and rate > 0.0:
                 check_rate(rate, limits, said=f"--rates {rate:g}")
         places = _places(
-            field, read, limits or limits_of(config, field.sprayer, margin), as_is, out
+            field, read, limits or limits_of(config, field.sprayer, margin), as_is, making.out
         )
         layers, missing = [], 0.0
         for path, values in zip(data, read, strict=True):
@@ -226,18 +198,14 @@ def zones(
         tell("making the zones", 2, 4)
         made = make_zones(np.array(layers), places, wish, limits)
         tell("writing the map", 3, 4)
-        map_file = _map_file(made, field, target, data, as_is)
+        map_file = _map_file(made, field, making.target, data, as_is)
         problems = problems_of(map_file, config, field)
-        files = written(map_file, out, target, config, field, problems, writer.name, force=force)
+        files = making.written(map_file, config, field, problems)
         if cleaned is not None and points is not None:
             write_points(cleaned, points)
             files = [*files, cleaned]
-    if png is not None:
-        draw_picture(map_file, png, title=out.name)
     result = _result(made, read, field, limits, missing, problems, files)
-    note_problems(result)
-    answer(result, _lines(result, made, read), as_json=as_json)
-    raise typer.Exit(0 if result["ok"] else 1)
+    making.answer(result, _lines(result, made, read))
 
 
 app.command(

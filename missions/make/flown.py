@@ -7,10 +7,10 @@ sprayer can follow on them, the checks of `map check`, and files, a flight map a
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import numpy as np
 import shapely
@@ -19,7 +19,16 @@ from shapely import MultiPolygon
 from shapely.geometry.base import BaseGeometry
 
 from companion.assembly import flow_range
-from companion.config import Config
+from companion.cli.answer import (
+    REQUIRED,
+    AsJson,
+    Option,
+    Overrides,
+    answer,
+    note_problems,
+    with_options,
+)
+from companion.config import Config, load
 from companion.config.tables import PrescriptionTable
 from companion.core.frame import LocalFrame
 from companion.core.nozzle import rate_for_flow
@@ -31,10 +40,10 @@ from missions.make.passes import Passes, by_valve, passes_of
 from missions.make.zones import EDGE_MAX_M, GRID_M, Limits
 from missions.maps.cli.options import plan_of, sprayer_problems
 from missions.maps.compiling import MapOrder, compile_map, write_flight_map
-from missions.maps.convert.formats import write_map
+from missions.maps.convert.formats import write_map, writer_for
 from missions.maps.lint import Sprayer, check_map
 from missions.maps.local import polygons_of
-from missions.maps.model import MapFile, not_written
+from missions.maps.model import MapFile, check_folder, not_written
 from missions.maps.registry import read_area
 from missions.reading import Asked, Task, read_task
 from missions.strips import Floats
@@ -158,13 +167,6 @@ def limits_of(config: Config, sprayer: Sprayer, margin: float) -> Limits:
     )
 
 
-def map_target(out: Path) -> Path:
-    """Return the map that is written: beside a flight map, the one that it is compiled from."""
-    if not is_flight_map(out):
-        return out
-    return out.with_name(out.name.removesuffix(".flightmap.gpkg") + ".gpkg")
-
-
 def problems_of(map_file: MapFile, config: Config, field: FlownField) -> list[Problem]:
     """Return what `map check` says of the map, flown as it was made for."""
     plan, found = plan_of(config, None)
@@ -174,37 +176,6 @@ def problems_of(map_file: MapFile, config: Config, field: FlownField) -> list[Pr
         *found,
         *sprayer_problems(config, map_file, plan),
     ]
-
-
-def written(
-    map_file: MapFile, out: Path, target: Path, config: Config, field: FlownField,
-    problems: Sequence[Problem], format_name: str, *, force: bool,
-) -> list[Path]:  # fmt: skip
-    """Write the map, and beside it the flight map if that is asked for."""
-    files = write_map(
-        map_file, target, format=format_name, force=force,
-        flow_width_m=config.boom_table.width_m, flow_speed_m_s=field.sprayer.speed_m_s,
-    )  # fmt: skip
-    if not is_flight_map(out):
-        return files
-    order = MapOrder.of(config)
-    changes = {"file": str(target.absolute()), "rate_field": None, "unit": None, "layer": None,
-               "sha256": None, "boundary": str(field.boundary_file.absolute())}  # fmt: skip
-    order = replace(order, table=order.table.model_copy(update=changes))
-    try:
-        write_flight_map(out, compile_map(order, findings=problems))
-    except OSError as error:
-        raise not_written(out, error) from None
-    return [out, *files]
-
-
-def draw_picture(
-    map_file: MapFile, path: Path, *, title: str, names: Mapping[str, str] | None = None
-) -> None:
-    """Draw the map that was made, with names on its zones."""
-    from missions.maps.picture import draw  # matplotlib, which not everybody has
-
-    draw(map_file, path, title=title, names=names)
 
 
 def check_rate(rate_l_ha: float, limits: Limits, *, said: str) -> None:
@@ -234,33 +205,136 @@ def numbers(text: str, option: str) -> list[float]:
 # A zone or a plot is this much longer than a change takes: for wind, and for the aircraft's speed.
 MARGIN = 1.5
 
-OutFile = Annotated[
-    Path, typer.Option("--out", metavar="FILE", help="The map; its suffix says the format.")
-]
-ConfigFile = Annotated[
-    Path, typer.Option("--config", metavar="FILE", help="Configuration of the flight.")
-]
-Boundary = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="Field outline; default: prescription.boundary."),
-]
-NoSpray = Annotated[
-    list[Path] | None, typer.Option(metavar="FILE", help="Ground not to spray; repeatable.")
-]
-CourseDeg = Annotated[
-    float | None,
-    typer.Option(metavar="DEG", help="Course of the passes; default: as vrspray plan."),
-]
 Margin = Annotated[
     float,
     typer.Option(
         metavar="X", help="Safety factor on the length that a change takes.", min=1.0, max=20.0
     ),
 ]
-Picture = Annotated[
-    Path | None, typer.Option("--png", metavar="FILE", help="Picture: .png, .svg or .pdf.")
-]
-FormatName = Annotated[
-    str | None,
-    typer.Option("--format", metavar="F", help="Format, where the suffix allows several."),
-]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Making:
+    """What every command that makes a map is asked, and what it does for all of them."""
+
+    out: Path
+    config_file: Path
+    boundary: Path | None
+    no_spray: list[Path] | None
+    angle_deg: float | None
+    png: Path | None
+    format_name: str | None
+    force: bool
+    overrides: list[str] | None
+    as_json: bool
+
+    @property
+    def target(self) -> Path:
+        """Return the map that is written: beside a flight map, the one that it is compiled from."""
+        if not is_flight_map(self.out):
+            return self.out
+        return self.out.with_name(self.out.name.removesuffix(".flightmap.gpkg") + ".gpkg")
+
+    def config(self, *others: Path | None) -> Config:
+        """Return the configuration of the flight; refuse what cannot be written."""
+        config = bounded(load(self.config_file, overrides=self.overrides or ()), self.boundary)
+        writer_for(self.target, self.format_name)
+        for path in filter(None, (self.out, self.png, *others)):
+            check_folder(path)
+        return config
+
+    def field(self, config: Config, across: str) -> FlownField:
+        """Return the field with its passes."""
+        return flown_field(config, self.no_spray or [], self.angle_deg, across)
+
+    def written(
+        self, map_file: MapFile, config: Config, field: FlownField, problems: Sequence[Problem],
+        names: Mapping[str, str] | None = None,
+    ) -> list[Path]:  # fmt: skip
+        """Write the map, and beside it the flight map and the picture if they are asked for."""
+        files = write_map(
+            map_file, self.target, format=writer_for(self.target, self.format_name).name,
+            force=self.force, flow_width_m=config.boom_table.width_m,
+            flow_speed_m_s=field.sprayer.speed_m_s,
+        )  # fmt: skip
+        if is_flight_map(self.out):
+            order = MapOrder.of(config)
+            changes = {
+                "file": str(self.target.absolute()), "rate_field": None, "unit": None,
+                "layer": None, "sha256": None, "boundary": str(field.boundary_file.absolute()),
+            }  # fmt: skip
+            order = replace(order, table=order.table.model_copy(update=changes))
+            try:
+                write_flight_map(self.out, compile_map(order, findings=problems))
+            except OSError as error:
+                raise not_written(self.out, error) from None
+            files = [self.out, *files]
+        if self.png is not None:
+            from missions.maps.picture import draw  # matplotlib, which not everybody has
+
+            draw(map_file, self.png, title=self.out.name, names=names)
+        return files
+
+    def answer(self, result: dict[str, Any], lines: Iterable[str]) -> NoReturn:
+        """Print what was made, and end."""
+        note_problems(result)
+        answer(result, lines, as_json=self.as_json)
+        raise typer.Exit(0 if result["ok"] else 1)
+
+
+making = with_options(
+    "making",
+    {
+        "out": Option(
+            Annotated[
+                Path,
+                typer.Option("--out", metavar="FILE", help="The map; its suffix says the format."),
+            ],
+            REQUIRED,
+        ),
+        "config_file": Option(
+            Annotated[
+                Path, typer.Option("--config", metavar="FILE", help="Configuration of the flight.")
+            ],
+            REQUIRED,
+        ),
+        "boundary": Option(
+            Annotated[
+                Path | None,
+                typer.Option(metavar="FILE", help="Field outline; default: prescription.boundary."),
+            ]
+        ),
+        "no_spray": Option(
+            Annotated[
+                list[Path] | None,
+                typer.Option(metavar="FILE", help="Ground not to spray; repeatable."),
+            ]
+        ),
+        "angle_deg": Option(
+            Annotated[
+                float | None,
+                typer.Option(metavar="DEG", help="Course of the passes; default: as vrspray plan."),
+            ]
+        ),
+        "png": Option(
+            Annotated[
+                Path | None,
+                typer.Option("--png", metavar="FILE", help="Picture: .png, .svg or .pdf."),
+            ]
+        ),
+        "format_name": Option(
+            Annotated[
+                str | None,
+                typer.Option(
+                    "--format", metavar="F", help="Format, where the suffix allows several."
+                ),
+            ]
+        ),
+        "force": Option(
+            Annotated[bool, typer.Option("--force", help="Replace existing files.")], False
+        ),
+        "overrides": Option(Overrides),
+        "as_json": Option(AsJson, False),
+    },
+    Making,
+)

@@ -15,46 +15,31 @@ from shapely import MultiPolygon
 from shapely.geometry.base import BaseGeometry
 
 from companion.cli.answer import (
-    AsJson,
-    Overrides,
-    answer,
     note,
-    note_problems,
     problem_object,
     progress,
 )
-from companion.config import Config, load
+from companion.config import Config
 from companion.core.frame import LocalFrame
 from companion.wording import counted
 from missions.files.write import check_suffix, refuse_existing, remove_older, write_fleet
 from missions.make.data import in_degrees, points_of
 from missions.make.flown import (
-    Boundary,
-    ConfigFile,
-    CourseDeg,
     FlownField,
-    FormatName,
-    NoSpray,
-    OutFile,
-    Picture,
-    bounded,
+    Making,
     check_rate,
-    draw_picture,
-    flown_field,
     limits_of,
-    map_target,
+    making,
     problems_of,
-    written,
 )
 from missions.make.passes import passes_of
 from missions.make.spots import Budget, Opening, Part, grounds, misses, openings, pieces
 from missions.maps.assemble import crs_of, ground_of, zone_names
-from missions.maps.convert.formats import writer_for
 from missions.maps.crs import to_longitude_latitude
 from missions.maps.csvfile import read_point_table
 from missions.maps.local import places as local_places
 from missions.maps.local import project_all
-from missions.maps.model import Grid, MapFile, MapZone, check_folder, digest, map_error, read_bytes
+from missions.maps.model import Grid, MapFile, MapZone, digest, map_error, read_bytes
 from missions.maps.registry import read_layer
 from missions.plan import Plan
 from missions.planner import plan_mission
@@ -100,10 +85,10 @@ class _OnSpots:
         return np.where(shapely.contains_xy(self._treated, east_m, north_m), self._rate, 0.0)
 
 
+@making
 def spots(
     weeds: Annotated[Path, typer.Argument(metavar="WEEDS", help="Points or small polygons.")],
-    out: OutFile,
-    config_file: ConfigFile,
+    making: Making,
     rate: Annotated[float, typer.Option(metavar="R", help="L/ha on the spots.", min=0.001)],
     weeds_m: Annotated[
         float,
@@ -135,20 +120,12 @@ def spots(
             metavar="FILE", help="Also write the quickest mission: .plan, .waypoints, ..."
         ),
     ] = None,
-    boundary: Boundary = None,
-    no_spray: NoSpray = None,
-    angle_deg: CourseDeg = None,
     crs: Annotated[
         str | None, typer.Option(metavar="C", help="CRS of WEEDS, where it does not say.")
     ] = None,
     layer: Annotated[
         str | None, typer.Option(metavar="L", help="Layer of WEEDS, where there are several.")
     ] = None,
-    png: Picture = None,
-    format_name: FormatName = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
-    overrides: Overrides = None,
-    as_json: AsJson = False,
 ) -> None:
     """Spray weeds alone, with ground around them.
 
@@ -158,18 +135,14 @@ def spots(
 
     Exit 0: made; 1: made, and the check of the map found errors; 2: refused.
     """
-    config = bounded(load(config_file, overrides=overrides or ()), boundary)
-    target = map_target(out)
-    writer = writer_for(target, format_name)
-    for path in (out, *(one for one in (png, mission) if one is not None)):
-        check_folder(path)
+    config = making.config(mission)
     if mission is not None:
         check_suffix(mission)
-        if not force:
+        if not making.force:
             refuse_existing(mission, option="--mission")
     with progress(after_s=BAR_AFTER_S) as tell:
         tell("planning the passes", 0, 4)
-        field = flown_field(config, no_spray or [], angle_deg, "valve")
+        field = making.field(config, "valve")
         limits = limits_of(config, field.sprayer, 1.0)
         check_rate(rate, limits, said=f"--rate {rate:g}")
         tell("reading the weeds", 1, 4)
@@ -189,19 +162,17 @@ def spots(
             shapely.union_all(grounds(opened, field.passes.edges_m)), field.turned()
         )
         chances = misses(field.passes.turned(found.middles), treated, budget)
-        map_file = _map_file(field, treated, target, weeds, rate)
+        map_file = _map_file(field, treated, making.target, weeds, rate)
         problems = problems_of(map_file, config, field)
         tell("planning the mission", 2, 4)
         plans = _plans(field, opened, treated, rate)
         best = min(plans, key=lambda name: plans[name].flight_s)
         tell("writing", 3, 4)
-        files = written(map_file, out, target, config, field, problems, writer.name, force=force)
+        files = making.written(map_file, config, field, problems)
         if mission is not None:
             more, marks = write_fleet(plans[best], mission)
             remove_older(mission, [*more, *marks])
             files = [*files, *more, *marks]
-    if png is not None:
-        draw_picture(map_file, png, title=out.name)
     ground_m2 = field.turned().area
     is_exposed = chances > budget.miss_share + 1e-9
     result: dict[str, Any] = {
@@ -240,9 +211,7 @@ def spots(
     }  # fmt: skip
     for warning in result["warnings"]:
         note(f"warning: {warning}")
-    note_problems(result)
-    answer(result, _lines(result), as_json=as_json)
-    raise typer.Exit(0 if result["ok"] else 1)
+    making.answer(result, _lines(result))
 
 
 # What is read.

@@ -20,40 +20,24 @@ from shapely.geometry.base import BaseGeometry
 
 from companion.atomic_write import write_atomically
 from companion.cli.answer import (
-    AsJson,
-    Overrides,
-    answer,
-    note_problems,
     problem_object,
 )
-from companion.config import load
 from companion.map_formats import geojson_feature, geojson_text
 from companion.wording import counted, refuse_existing
 from missions.errors import PlanError
 from missions.make.flown import (
     MARGIN,
-    Boundary,
-    ConfigFile,
-    CourseDeg,
     FlownField,
-    FormatName,
+    Making,
     Margin,
-    NoSpray,
-    OutFile,
-    Picture,
-    bounded,
     check_rate,
-    draw_picture,
-    flown_field,
     limits_of,
-    map_target,
+    making,
     numbers,
     problems_of,
-    written,
 )
-from missions.maps.convert.formats import writer_for
 from missions.maps.local import polygons_of
-from missions.maps.model import MapFile, MapZone, check_folder, digest, not_written, read_bytes
+from missions.maps.model import MapFile, MapZone, digest, not_written, read_bytes
 from missions.strips import Floats
 
 
@@ -205,9 +189,9 @@ VERSION = 1
 BLOCKS_MAX, TREATMENTS_MAX = 50, 20
 
 
+@making
 def trial(
-    out: OutFile,
-    config_file: ConfigFile,
+    making: Making,
     rates: Annotated[str, typer.Option(metavar="R,R,...", help="L/ha of the treatments.")],
     rest: Annotated[
         float, typer.Option(metavar="R", help="L/ha on the ground around the plots.", min=0.0)
@@ -248,14 +232,6 @@ def trial(
     seed: Annotated[
         int, typer.Option(metavar="N", help="Seed of the random order; it is recorded.", min=0)
     ] = 1,
-    boundary: Boundary = None,
-    no_spray: NoSpray = None,
-    angle_deg: CourseDeg = None,
-    png: Picture = None,
-    format_name: FormatName = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing map.")] = False,
-    overrides: Overrides = None,
-    as_json: AsJson = False,
 ) -> None:
     """Lay out a randomised trial that the sprayer can follow.
 
@@ -264,15 +240,11 @@ def trial(
 
     Exit 0: made; 1: made, and the check of the map found errors; 2: refused.
     """
-    config = bounded(load(config_file, overrides=overrides or ()), boundary)
-    target = map_target(out)
+    config, target = making.config(), making.target
     record = target.with_name(f"{target.stem}.trial.geojson")
-    writer = writer_for(target, format_name)
-    for path in (out, *([] if png is None else [png])):
-        check_folder(path)
-    refuse_existing(record, force=force)
+    refuse_existing(record, force=making.force)
     treatments = _treatments(rates, check)
-    field = flown_field(config, no_spray or [], angle_deg, "swath")
+    field = making.field(config, "swath")
     limits = limits_of(config, field.sprayer, margin)
     for rate in filter(None, (*treatments, rest)):
         check_rate(rate, limits, said=f"{rate:g} L/ha")
@@ -296,15 +268,13 @@ def trial(
     plots = lay_out(ground, field.passes.edges_m, design)
     map_file = _map_file(plots, design, field, target, rest)
     problems = problems_of(map_file, config, field)
-    files = written(map_file, out, target, config, field, problems, writer.name, force=force)
+    files = making.written(map_file, config, field, problems, _names(plots, treatments))
     said = _said(design, field, rest, check=check is not None)
     text = geojson_text(_features(plots, design, field), trial=said)
     try:
         write_atomically(record, text.encode())
     except OSError as error:
         raise not_written(record, error) from None
-    if png is not None:
-        draw_picture(map_file, png, title=out.name, names=_names(plots, treatments))
     ok = not any(problem.severity == "error" for problem in problems)
     result = {
         "ok": ok,
@@ -316,9 +286,7 @@ def trial(
             for plot in plots
         ],
     }
-    note_problems(result)
-    answer(result, _lines(result, plots, design), as_json=as_json)
-    raise typer.Exit(0 if ok else 1)
+    making.answer(result, _lines(result, plots, design))
 
 
 def _names(plots: Sequence[Plot], rates_l_ha: Sequence[float]) -> dict[str, str]:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from companion.atomic_write import write_atomically
 from companion.errors import ConfigError
-from companion.wording import missing
+from companion.wording import missing, writing
 from sitl.campaign.bundle import Bundle, code_sha256, versions
 from sitl.campaign.design import Campaign, read_campaign
 from sitl.campaign.flying import BY_RATE, BY_RATE_COUNTS, figure_types
@@ -185,7 +185,7 @@ def open_dataset(campaign: Campaign, bundle: Bundle, folder: Path) -> Dataset:
         "simulated": True,
     }
     text = json.dumps(manifest, indent=1, sort_keys=True) + "\n"
-    try:
+    with writing(f"--out {folder}"):
         if before is not None:
             _refuse_other(folder, before, manifest, GROWING if grows else ())
             if not grows:
@@ -195,10 +195,6 @@ def open_dataset(campaign: Campaign, bundle: Bundle, folder: Path) -> Dataset:
         (folder / FLIGHTS).mkdir(parents=True, exist_ok=True)
         write_atomically(folder / COPY, campaign.text.encode())
         write_atomically(folder / MANIFEST, text.encode())
-    except OSError as error:
-        raise ConfigError(
-            f"--out {folder}: cannot be written ({error.strerror}); give a folder that can"
-        ) from error
     return dataset
 
 

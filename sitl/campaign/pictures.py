@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from companion.errors import ConfigError
+from companion.wording import writing
 from sitl.campaign.show import CONFIDENCE, Floats, Group, Index, Rows, shown_value
 
 if TYPE_CHECKING:
@@ -42,16 +42,12 @@ def draw_pictures(
             SENSITIVITY: _sensitivity(rows, found),
         }
         files = []
-        try:
+        with writing(f"--plots {folder}"):
             folder.mkdir(parents=True, exist_ok=True)
             for name, figure in drawn.items():
                 if figure is not None:
                     files.append(folder / name)
                     figure.savefig(files[-1], dpi=DPI, facecolor="white")
-        except OSError as error:
-            raise ConfigError(
-                f"--plots {folder}: cannot be written ({error.strerror}); give a folder that can"
-            ) from error
     return files
 
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from companion.atomic_write import write_atomically
 from companion.csv_table import csv_of
 from companion.errors import ConfigError
-from companion.wording import missing
+from companion.wording import missing, writing
 from sitl.campaign.dataset import COPY, arrow, parquet_of, read_columns, read_manifest
 from sitl.campaign.design import (
     GRID,
@@ -393,12 +393,8 @@ def write_tables(path: Path, groups: Sequence[Group]) -> None:
         names = dict.fromkeys(name for row in rows for name in row)
         columns = {name: [row.get(name) for row in rows] for name in names}
         content = parquet_of(arrow().table(columns))
-    try:
+    with writing(f"--out {path}"):
         write_atomically(path, content)
-    except OSError as error:
-        raise ConfigError(
-            f"--out {path}: cannot be written ({error.strerror}); give a folder that can"
-        ) from error
 
 
 def _tidy(each: Group) -> Iterator[dict[str, Any]]:

@@ -16,6 +16,7 @@ from analysis.exports.cli import FORMATS, format_for
 from analysis.exports.columns import plain_names
 from analysis.exports.output import ExportError, write_beside, write_folder
 from companion.cli.app import execute
+from companion.errors import ConfigError
 from companion.journal.journal import Journal
 from tests.analysis.export_flight import fly
 from tests.builders import setup
@@ -216,7 +217,7 @@ def half_then(error: BaseException) -> Iterator[bytes]:
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])
 def test_what_is_interrupted_leaves_nothing_behind(out: Path, error: BaseException) -> None:
-    expected = ExportError if isinstance(error, OSError) else KeyboardInterrupt
+    expected = ConfigError if isinstance(error, OSError) else KeyboardInterrupt
     (out / "f.csv").write_text("old")
     with pytest.raises(expected):
         write_beside(out / "f.csv", {"f.csv": half_then(error)}, force=True)
@@ -288,7 +289,7 @@ def test_files_that_cannot_all_be_moved_leave_what_was_there(
         return rename(self, target)
 
     monkeypatch.setattr(Path, "rename", failing)
-    with pytest.raises(ExportError, match="cannot be written"):
+    with pytest.raises(ConfigError, match="cannot be written"):
         write_beside(out, {"a.dbf": [b"new"], "a.shp": [b"new"]}, force=True)
     assert {each.name: each.read_bytes() for each in tmp_path.iterdir()} == {
         "a.dbf": b"old",
@@ -309,7 +310,7 @@ def test_a_folder_that_cannot_be_moved_leaves_what_was_there(
         return rename(self, target)
 
     monkeypatch.setattr(Path, "rename", failing)
-    with pytest.raises(ExportError, match="cannot be written"):
+    with pytest.raises(ConfigError, match="cannot be written"):
         write_folder(out, {"a.xml": [b"new"]}, force=True)
     assert (out / "a.xml").read_bytes() == b"old"
     assert [each.name for each in tmp_path.iterdir()] == ["TASKDATA"]

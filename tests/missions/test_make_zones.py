@@ -486,7 +486,7 @@ def test_the_flight_map_is_written_beside_the_map_that_it_is_made_from(
         (["nowhere.tif", "--rates", "9,9"], "there is no such file"),
         (["soil.csv", "--rates", "9,9", "--cleaned", "a.xlsx"], "written as .csv or .geojson"),
         (["soil.csv", "--rates", "9,9", "--cleaned", "soil.csv"], "would replace the data"),
-        (["soil.csv", "--rates", "9,9", "--cleaned", "yield.csv"], "exists; another --cleaned"),
+        (["soil.csv", "--rates", "9,9", "--cleaned", "yield.csv"], "give another --cleaned"),
         (["satellite.tif", "--value", "NDVI", "--rates", "9,9", "--cleaned", "b.csv"],
          "takes one file of points, and DATA has no points"),
     ],

@@ -24,7 +24,7 @@ def test_demo_has_help_with_an_example(capsys: Captured) -> None:
         (["--speed", "5", "--speed", "nan"], "--speed nan: outside [1, 15] m/s"),
         (["--output", "servo", "--fidelity", "averaged"], "--output servo: the averaged twin"),
         (["--seed", "-1"], "--seed"),
-        (["--out", "{file}"], "cannot be written (File exists); give a folder that can"),
+        (["--out", "{file}"], "cannot be written (File exists); check folder"),
     ],
 )
 def test_what_cannot_be_done_is_refused_in_one_line(
