@@ -19,7 +19,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from missions.plan import Leg, Place, Settings, Sortie, is_high
-from missions.stops import NEAR_M, SAME_M, is_passed, near_pairs, waypoints_of
+from missions.stops import NEAR_M, SAME_M, is_passed, middle, near_pairs, waypoints_of
 from missions.strips import Floats
 from missions.ways import Ways
 
@@ -344,7 +344,7 @@ def _as_one(before: Leg, leg: Leg, after: Leg, *, keeps: bool) -> _Option | None
     one, other = before.points[0], after.points[-1]
     at: Place | None = None
     if far_m < SAME_M:
-        at = _middle(end, start)
+        at = middle(end, start)
         both_are_short = max(math.dist(one, at), math.dist(at, other)) < NEAR_M
         if is_passed(one, at, other) and not both_are_short and not keeps:
             at = None
@@ -374,14 +374,10 @@ def _at(legs: Sequence[Leg], pair: Pair) -> frozenset[int]:
         number
         for number, leg in enumerate(legs)
         if leg.kind != "spray"
-        for one in (*leg.points, _middle(leg.points[0], leg.points[-1]))
+        for one in (*leg.points, middle(leg.points[0], leg.points[-1]))
         for place in pair
         if abs(one[0] - place[0]) < TOUCH_M and math.dist(one, place) < TOUCH_M
     )
-
-
-def _middle(one: Place, other: Place) -> Place:
-    return (one[0] + other[0]) / 2.0, (one[1] + other[1]) / 2.0
 
 
 def _near(first: Place, inner: Sequence[Place], last: Place) -> int:
@@ -509,12 +505,12 @@ def _nodes(
     )
 
 
-def _ring(middle: Place) -> list[Place]:
+def _ring(center: Place) -> list[Place]:
     """Return a place and others all around it."""
     return [
-        middle,
+        center,
         *(
-            (middle[0] + far_m * math.cos(turn), middle[1] + far_m * math.sin(turn))
+            (center[0] + far_m * math.cos(turn), center[1] + far_m * math.sin(turn))
             for far_m in OUT_M
             for turn in (math.tau * step / RING for step in range(RING))
         ),

@@ -215,13 +215,13 @@ def _add(stops: list[Stop], place: Place, speed_m_s: float, *, apart: bool) -> N
     """Add the start of a line; one that the last line goes on in is already there."""
     last = stops[-1]
     if last.opens is False and math.dist(last.place, place) < SAME_M and not apart:
-        middle = _middle(last.place, place)
-        stops[-1] = Stop(place=middle, speed_m_s=last.speed_m_s, on_line=True)
+        stops[-1] = Stop(place=middle(last.place, place), speed_m_s=last.speed_m_s, on_line=True)
         return
     stops.append(Stop(place=place, speed_m_s=speed_m_s, opens=True, on_line=True))
 
 
-def _middle(one: Place, other: Place) -> Place:
+def middle(one: Place, other: Place) -> Place:
+    """Return the place halfway."""
     return (one[0] + other[0]) / 2.0, (one[1] + other[1]) / 2.0
 
 
@@ -367,7 +367,7 @@ def _ways(sortie: Sortie, lines_m: float) -> list[_Stretch]:
         if _is_no_way(sortie, number):
             # The ends of both lines are one waypoint, in the middle: beside another place than
             # that it might be left out where it is written, or the other way round.
-            here = _middle(leg.points[0], leg.points[-1])
+            here = middle(leg.points[0], leg.points[-1])
             if found:
                 found[-1] = found[-1]._replace(end=here)
             continue

@@ -12,7 +12,7 @@ from shapely import Geometry, MultiPolygon, Polygon
 
 from companion.core.outline import dissolved, without_overlay
 from missions.maps.build import frame_for
-from missions.maps.cells import cell_areas_m2, cell_size_m, to_degrees
+from missions.maps.cells import bounds_deg, cell_areas_m2, cell_size_m, to_degrees
 from missions.maps.local import make_valid, project, project_all
 from missions.maps.model import MapCells, MapFile, MapZone
 from missions.maps.totals import Ground, inside_m2
@@ -148,16 +148,7 @@ class Survey:
         if self.cells is None:
             west, south, east, north = shapely.total_bounds(_geometries(self.zones)).tolist()
             return west, south, east, north
-        rows, columns = self.rates.shape
-        column = np.array([0.0, columns, columns, 0.0])
-        row = np.array([0.0, 0.0, rows, rows])
-        longitude, latitude = to_degrees(self.cells, column, row)
-        return (
-            float(longitude.min()),
-            float(latitude.min()),
-            float(longitude.max()),
-            float(latitude.max()),
-        )
+        return bounds_deg(self.cells)
 
     @cached_property
     def cell_size_m(self) -> tuple[float, float] | None:
