@@ -34,6 +34,7 @@ class Kind:
         formats: those that can carry it; None: all of polygons.
         options: what the user gives.
         spoil: what is done to the bytes afterwards.
+        row: what the table of kinds calls it together with its like; empty: its own name.
         outline: it is the outline of a field, given to `plan`.
         writer: who writes it, where that is not the format's own writer.
     """
@@ -45,6 +46,7 @@ class Kind:
     options: tuple[str, ...] = UNIT
     spoil: Callable[[Path], object] | None = None
     outline: bool = False
+    row: str = ""
     writer: Callable[[Ground, Path], Path] | None = None
 
     def writers(self) -> dict[str, writers.Writer]:

@@ -561,6 +561,13 @@ OF_OUTLINES = [
 ]
 
 
-KINDS: list[Kind] = [
-    *OF_ZONES, *OF_CRS, *OF_COLUMNS, *OF_UNITS, *OF_OUTLINES, *RASTERS, *POINTS,
-]  # fmt: skip
+# A rule a table, in the reference.
+RULES: dict[str, list[Kind]] = {
+    "Which column is the rate": OF_COLUMNS,
+    "The unit": OF_UNITS,
+    "The coordinate reference system": OF_CRS,
+    "Zones": OF_ZONES,
+    "The outline of a field": OF_OUTLINES,
+    "Cells and no data": RASTERS,
+    "Points": POINTS,
+}
