@@ -254,7 +254,7 @@ def grows(column: Column, areas: Floats) -> bool:
         values = _numbers(column)
     except ValueError:
         return False
-    some = (values > 0.0) & (areas > 0.0)
+    some = (values > 0.0) & np.isfinite(values) & (areas > 0.0)
     if np.count_nonzero(some) < 2:
         return False
     value, area = np.log(values[some]), np.log(areas[some])

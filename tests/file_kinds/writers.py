@@ -7,6 +7,7 @@ import os
 import shutil
 import struct
 import subprocess
+import warnings
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -41,17 +42,19 @@ def by_gdal(driver: str, suffix: str, **options: Any) -> Writer:
         columns = [_array(values) for values in ground.columns.values()]
         crs = ground.crs_text or (None if ground.epsg is None else f"EPSG:{ground.epsg}")
         kinds = {one.geom_type for one in polygons}
-        pyogrio.raw.write(
-            path,
-            geometry=np.array(shapely.to_wkb(polygons), dtype=object),
-            field_data=[values for values, _ in columns],
-            field_mask=[missing for _, missing in columns],
-            fields=np.array(list(ground.columns), dtype=object),
-            crs=crs,
-            driver=driver,
-            geometry_type=next(iter(kinds)) if len(kinds) == 1 else "Unknown",
-            **options,
-        )
+        with warnings.catch_warnings():  # that no CRS was given, which is meant
+            warnings.filterwarnings("ignore", "'crs' was not provided")
+            pyogrio.raw.write(
+                path,
+                geometry=np.array(shapely.to_wkb(polygons), dtype=object),
+                field_data=[values for values, _ in columns],
+                field_mask=[missing for _, missing in columns],
+                fields=np.array(list(ground.columns), dtype=object),
+                crs=crs,
+                driver=driver,
+                geometry_type=next(iter(kinds)) if len(kinds) == 1 else "Unknown",
+                **options,
+            )
         return path
 
     return write
@@ -113,7 +116,7 @@ const given = JSON.parse(fs.readFileSync(0));
 (async () => {
     const manager = new ISOXMLManager({version: 4});
     const make = (tag, values) => manager.createEntityFromAttributes(tag, values);
-    const ring = (points, kind) => make('LSG', {LinestringType: kind, Point: points.map(
+    const ring = (points, kind) => make('LSG', {LineStringType: kind, Point: points.map(
         ([x, y]) => make('PNT', {PointType: '2', PointNorth: y, PointEast: x}))});
     const polygon = (rings, kind) => make('PLN', {PolygonType: kind,
         LineString: rings.map((one, k) => ring(one, k ? '2' : '1'))});
