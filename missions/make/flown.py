@@ -113,7 +113,7 @@ def _by_valve(passes: Passes, config: Config) -> Passes:
 def flown_field(
     config: Config, no_spray: Sequence[Path], angle_deg: float | None, across: str
 ) -> FlownField:
-    """Return the field with its passes, those that `vrspray plan` lays, up to the border."""
+    """Return the field with its passes, those that `vrspray plan` lays, as far from the border."""
     table = config.prescription
     path = None if table is None or table.boundary is None else config.resolve(table.boundary)
     if path is None:
@@ -121,7 +121,7 @@ def flown_field(
             f"{config.path}: prescription.boundary: missing; where the field ends is not in the "
             "data, so name its outline there or with --boundary"
         )
-    asked = Asked(field=path, rate_l_ha=1.0, no_spray=tuple(no_spray), border_m=0.0)
+    asked = Asked(field=path, rate_l_ha=1.0, no_spray=tuple(no_spray))
     task = read_task(asked, config, {"angle_deg": angle_deg})
     lines, course_deg = spray_lines(task.field, task.settings, task.settings.motion)
     if not len(lines):

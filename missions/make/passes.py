@@ -84,10 +84,13 @@ def passes_of(lines: Floats, angle_deg: float, ground: BaseGeometry, swath_m: fl
     edges = [(one + two) / 2.0 for one, two in pairwise(middles)]
     edges = [middles[0] - swath_m / 2.0, *edges, middles[-1] + swath_m / 2.0]
     edges = _filled(edges, swath_m)
-    while edges[0] > low:
+    # What passes keep from the border is no band: nothing is flown there.
+    beside_m = (1.0 - APART_MIN) * swath_m
+    while edges[0] > low + beside_m:
         edges.insert(0, edges[0] - swath_m)
-    while edges[-1] < high:
+    while edges[-1] < high - beside_m:
         edges.append(edges[-1] + swath_m)
+    edges[0], edges[-1] = min(edges[0], low), max(edges[-1], high)
     beside = np.abs(right[:, None] - np.array(middles)[None, :]).min(axis=1)
     aligned = parallel & (beside <= BESIDE_MAX_M)
     share = float(length_m[aligned].sum() / length_m.sum()) if len(lines) else 0.0

@@ -167,7 +167,8 @@ def test_strips_run_as_long_as_the_field(
     for one in record["features"]:
         if one["properties"]["part"] == "plot":
             area = local(shapely.from_geojson(json.dumps(one["geometry"])))
-            assert area.area == pytest.approx((140.0 - 2 * 6.0) * 6.0, rel=0.02)
+            # A pass of 6 m, or one beside the overlap that the distance from the border makes.
+            assert area.area == pytest.approx((140.0 - 2 * 6.0) * 6.0, rel=0.05)
 
 
 @pytest.mark.parametrize(

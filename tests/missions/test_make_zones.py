@@ -291,6 +291,11 @@ def test_bands_lie_around_the_planned_passes() -> None:
     found = passes_of(np.vstack([lines, [[0.0, 3.0, 20.0, 3.0]]]), 0.0, ground, 6.0)
     assert found.edges_m.tolist() == [0.0, 5.75, 11.25, 17.0, 23.0]
     assert found.aligned_percent == pytest.approx(100 * 282 / 302)
+    # What passes keep from the border is no band of its own.
+    ground = shapely.box(0.0, 0.0, 12.4, 100.0)
+    lines = np.array([[right, 3.2, right, 96.8] for right in (3.2, 9.2)])
+    edges = passes_of(lines, 0.0, ground, 6.0).edges_m
+    assert edges == pytest.approx(np.array([0.0, 6.2, 12.4]))
 
 
 # From files to a map, and the map's judge.
