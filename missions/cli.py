@@ -52,7 +52,7 @@ from missions.reading_outline import CORRIDOR_MAX_M, RADIUS_MAX_M
 from missions.remaining import UntreatedRates
 from missions.searching import Watch, watched
 from missions.sheet import sheet, sortie_lines
-from missions.treated import treated_by, treated_lines
+from missions.treated import thirsty_warnings, treated_by, treated_lines
 
 # Attempted moves of the search: about one second, ten, and a minute on an old laptop.
 MOVES = {"quick": 40_000, "good": 300_000, "best": 2_000_000}
@@ -296,18 +296,25 @@ def plan(
                 around=task.around, with_sprayer=sprayer, fences=fences if is_fenced else None,
             )  # fmt: skip
     is_rest = task.left is not None or isinstance(task.rates, UntreatedRates)
-    flown_s = [planned.airborne_s(sortie) for sortie in planned.sorties]
-    by_label = label_warnings(reading.config, flown_s, datetime.now(tz=UTC).timestamp())
+    by_label = label_warnings(
+        reading.config,
+        [planned.airborne_s(sortie) for sortie in planned.sorties],
+        datetime.now(tz=UTC).timestamp(),
+    )
+    planned = replace(
+        planned,
+        wind=task.wind,
+        treated=None if is_rest else treated_by(planned, task.rates),
+        settings=with_tank(planned.settings, in_tank_l),
+    )
     planned = replace(
         planned,
         warnings=(
             *task.said,
             *by_label,
             *planned.warnings,
+            *thirsty_warnings(planned),
         ),
-        wind=task.wind,
-        treated=None if is_rest else treated_by(planned, task.rates),
-        settings=with_tank(planned.settings, in_tank_l),
     )
     took_s = perf_counter() - start
     choices: list[tuple[Price, str]] = []

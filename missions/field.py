@@ -42,6 +42,9 @@ MITRE_LIMIT = 5.0
 # not, the outline's tolerance is made less, and after so many times it stays as it was drawn. A
 # plan covers 99.8 %.
 LOST_MAX, TOLERANCE_LESS, TOLERANCES = 0.0017, 0.6, 6
+# Where outer valves close along the border, bare ground counts, not reach: pieces of 2 m around a
+# curve are flown too slowly to spray, and left ten times that bare.
+LOST_CLOSING = 0.01
 # A tolerance so many times the one that would lose just what may be lost is not tried.
 CLEARLY = 1.5
 EXTENT_MAX_M = 20_000.0
@@ -156,7 +159,7 @@ def build_field(
     blocked = shapely.union_all([*holes, _simply_around(kept, BLOCKED_TOLERANCE_M)])
     flown = outline.difference(kept)
     around = _around(outline, kept)
-    inside, tolerance_m = _simpler(outline, kept, around, tolerance_m, swath_width_m)
+    inside, tolerance_m = _simpler(outline, kept, around, tolerance_m, swath_width_m, kept_m)
     fly, high = None, None
     if inside is not None:
         fly = as_area(polygons_of(inside.difference(around)))
@@ -293,6 +296,7 @@ def _simpler(
     around: BaseGeometry,
     tolerance_m: float,
     swath_width_m: float,
+    kept_m: float,
 ) -> tuple[Area | None, float]:
     """Return the ground a margin inside the outline, few-cornered, and within which tolerance.
 
@@ -302,15 +306,16 @@ def _simpler(
     inside = as_area(polygons_of(outline.buffer(-MARGIN_M, join_style="mitre")))
     if inside is None:
         return None, 0.0
+    lost_max = LOST_CLOSING if kept_m else LOST_MAX
     reached_m2 = reachable(inside.difference(kept), swath_width_m).area
     spare_m2 = reachable(inside.difference(around), swath_width_m).area
-    spare_m2 -= (1.0 - LOST_MAX) * reached_m2
+    spare_m2 -= (1.0 - lost_max) * reached_m2
     likely_m = math.inf if spare_m2 > 0.0 else 0.0
     for _ in range(TOLERANCES if tolerance_m > 0.0 else 0):
         if tolerance_m <= likely_m:
             simple = inside_with_fewer_corners(inside, tolerance_m)
             left_m2 = reachable(simple.difference(around), swath_width_m).area
-            short_m2 = (1.0 - LOST_MAX) * reached_m2 - left_m2
+            short_m2 = (1.0 - lost_max) * reached_m2 - left_m2
             if short_m2 <= 0.0:
                 return simple, tolerance_m
             # What is lost is about as much as the tolerance, as with obstacles.

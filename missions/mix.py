@@ -106,7 +106,7 @@ def mix_of(
         )
     filled = filled_of(plan)
     adds_l = [(sortie.number, filled[sortie.number]["add_l"]) for sortie in plan.sorties]
-    total_l, sprayed_l = sum(add_l for _, add_l in adds_l), plan.volume_l
+    total_l, sprayed_l = sum(add_l for _, add_l in adds_l), sum(map(plan.needs_l, plan.sorties))
     # What is in the tank already holds the products in the same shares: it is no new mix.
     left_l = plan.settings.in_tank_l + total_l - sprayed_l
     for each in products:

@@ -398,7 +398,7 @@ def write_legend(figure: Figure, plan: Plan, seen: dict[str, bool], *, left: flo
     room = max(4, math.floor((high_in - ABOVE_IN) / ROW_IN) - len(handles) - 2)
     listed = plan.sorties[: min(LISTED_MAX, room)]
     for sortie in listed:
-        fill_l = sortie.volume_l + plan.settings.reserve_l
+        fill_l = min(plan.needs_l(sortie) + plan.settings.reserve_l, plan.settings.tank_l)
         words = (
             f"sortie {sortie.number}", f"fill {fill_l:.1f} L",
             f"{plan.airborne_s(sortie) / 60:.1f} min",

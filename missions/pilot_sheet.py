@@ -146,14 +146,14 @@ Table = list[list[str]]
 def _facts(plan: Plan, found: dict[str, Any], product: Product) -> Facts:
     """Return what holds for all sorties."""
     settings, rows = plan.settings, found["sorties"]
-    adds_l = sum(row["add_l"] for row in rows)
+    adds_l, needs_l = (sum(row[name] for row in rows) for name in ("add_l", "needs_l"))
     facts = [
         ("Field", f"{found['coverage_percent']:.2f} % covered of {ground_text(found)}"),
-        ("To mix", f"{adds_l:.1f} L: {found['volume_l']:.1f} L to spray, the rest is reserve"),
+        ("To mix", f"{adds_l:.1f} L: {needs_l:.1f} L to spray, the rest is reserve"),
     ]
     if settings.in_tank_l > 0.0:
         text = f"{adds_l:.1f} L, beside the {settings.in_tank_l:g} L that are in the tank"
-        facts[1] = ("To mix", f"{text}; {found['volume_l']:.1f} L to spray, the rest is reserve")
+        facts[1] = ("To mix", f"{text}; {needs_l:.1f} L to spray, the rest is reserve")
     mix = found.get("mix")
     if mix is not None:
         facts += [
@@ -234,7 +234,7 @@ def _table(plan: Plan, found: dict[str, Any], product: Product, start_min: int |
         ("in the air\nmin", [f"{row['airborne_s'] / 60:.1f}" for row in rows],
          f"{sum(row['airborne_s'] for row in rows) / 60:.1f}"),
         ("passes", [str(row["swaths"]) for row in rows], _sum(rows, "swaths", 0)),
-        ("spray\nL", [f"{row['volume_l']:.1f}" for row in rows], _sum(rows, "volume_l", 1)),
+        ("spray\nL", [f"{row['needs_l']:.1f}" for row in rows], _sum(rows, "needs_l", 1)),
         ("sprayed twice\nL", [f"{row['overlap_l']:.2f}" for row in rows],
          _sum(rows, "overlap_l", 2)),
         ("farthest\nm", [f"{row['farthest_m']:.0f}" for row in rows],

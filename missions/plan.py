@@ -44,7 +44,9 @@ class Settings:
     an end of the boom may be beyond the border, where its valves are closed.
     `in_tank_l` is the mix that is in the first aircraft's tank before its first sortie.
     Sorties are blocks from side to side; as `stripes` they may lie in between each other.
-    On a line is who is no farther aside and off its course (`mission.lines_aside_m`).
+    On a line is who is no farther aside and off its course (`mission.lines_aside_m`). Valves are
+    open, or closed, `opens_s` and `closes_s` after what the aircraft does, the last flow ends
+    `ends_s` after the order.
     Without them, `jerk_m_s3` and `return_height_m` are those that the autopilot comes with.
     """
 
@@ -81,6 +83,9 @@ class Settings:
     stripes: bool = False
     lines_aside_m: float = 1.0
     lines_course_deg: float = 20.0
+    opens_s: float = 0.2
+    closes_s: float = 0.2
+    ends_s: float = 0.15
 
     def __post_init__(self) -> None:
         for name in ("swath_width_m", "speed_m_s", "height_m", "acceleration_m_s2", "tank_l"):
@@ -244,12 +249,15 @@ def flown_lines(sorties: Sequence[Sortie]) -> Floats:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Treated:
-    """What the flight leaves `bare` of the ground with a rate, treats `twice`, and puts out."""
+    """What the flight leaves `bare` of the ground with a rate, treats `twice`, and puts out.
+
+    `litres` are of each sortie by its number.
+    """
 
     ground_m2: float
     bare: BaseGeometry
     twice: BaseGeometry
-    volume_l: float
+    litres: dict[int, float]
 
     @property
     def percent(self) -> float:
@@ -262,7 +270,7 @@ class Treated:
             "treated_percent": self.percent,
             "bare_m2": float(self.bare.area),
             "twice_m2": float(self.twice.area),
-            "treated_l": self.volume_l,
+            "treated_l": sum(self.litres.values()),
         }
 
 
@@ -304,6 +312,11 @@ class Plan:
     def volume_l(self) -> float:
         """Return what is sprayed in all."""
         return sum(sortie.volume_l for sortie in self.sorties)
+
+    def needs_l(self, sortie: Sortie) -> float:
+        """Return what a tank is filled for: what passes ask for, and no less than what falls."""
+        falls_l = 0.0 if self.treated is None else self.treated.litres.get(sortie.number, 0.0)
+        return max(sortie.volume_l, falls_l)
 
     @property
     def flight_s(self) -> float:

@@ -295,6 +295,7 @@ def _settings(config: Config | None, changes: dict[str, float | int | None]) -> 
             switch_off_percent=config.switch_off_percent(on_lines=True),
             lines_aside_m=mission.lines_aside_m,
             lines_course_deg=mission.lines_course_deg,
+            **_acts_s(config),
             **fleet_settings(mission),
         )
     given: dict[str, Any] = {name: each for name, each in changes.items() if each is not None}
@@ -499,6 +500,20 @@ def _settle_s(config: Config) -> float:
     lag = config.lag
     slowest_s = max(lag.on_s, lag.off_s, lag.up_s, lag.down_s) + lag.output_s
     return slowest_s + config.pwm_limits().period_s
+
+
+def _acts_s(config: Config) -> dict[str, Any]:
+    """Return how long after the aircraft's state valves are open, or closed, as volumes count.
+
+    Half of the time between two positions is how late a state is heard of in the mean.
+    """
+    lag = config.lag
+    heard_s = lag.position_s + 0.5 / config.link.position_rate_hz + lag.output_s
+    return {
+        "opens_s": heard_s + lag.on_s,
+        "closes_s": heard_s + lag.off_s,
+        "ends_s": lag.off_end_s + lag.output_s,
+    }
 
 
 # The rates of a prescription at hundreds of thousands of places at once.

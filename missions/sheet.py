@@ -171,13 +171,16 @@ class _Aboard:
     def fill(self, sortie: Sortie) -> dict[str, Any]:
         """Return what is put in before a sortie, and what is left after it.
 
-        What the sortie before left, its reserve at least, is still in the tank, and nobody pours it
+        `needs_l` is what passes ask for, or what the flight puts out where that is more. What the
+        sortie before left, its reserve at least, is still in the tank, and nobody pours it
         out.
         """
+        # The tank holds no more: beyond that it is the reserve that is sprayed (and warned of).
+        needs_l = min(self._plan.needs_l(sortie), self._plan.settings.usable_l)
         reserve_l = self._plan.settings.reserve_l
         before_l = self._left_l.get(sortie.aircraft, 0.0)
-        add_l = max(sortie.volume_l + (reserve_l - before_l), 0.0)
-        self._left_l[sortie.aircraft] = max(reserve_l, before_l - sortie.volume_l)
+        add_l = max(needs_l + (reserve_l - before_l), 0.0)
+        self._left_l[sortie.aircraft] = max(reserve_l, before_l - needs_l)
         first = sortie.aircraft not in self._left_wh
         battery, used_wh = self._plan.settings.battery, self._plan.energy_wh(sortie)
         capacity_wh = None if battery is None else battery.capacity_wh
@@ -190,8 +193,9 @@ class _Aboard:
             self._left_wh[sortie.aircraft] = left_wh
             used, left = 100.0 * used_wh / capacity_wh, 100.0 * left_wh / capacity_wh
         return {
-            "fill_l": max(sortie.volume_l + reserve_l, before_l),
+            "fill_l": max(needs_l + reserve_l, before_l),
             "add_l": add_l,
+            "needs_l": needs_l,
             "first": first,
             "battery_percent": used,
             "battery_left_percent": left,
@@ -286,7 +290,7 @@ def sortie_lines(plan: Plan, found: dict[str, Any]) -> list[str]:
 
 def _line(plan: Plan, sortie: Sortie, row: dict[str, Any]) -> str:
     texts = [
-        f"sortie {sortie.number:3}  fill to {row['fill_l']:6.2f} L, spray {sortie.volume_l:6.2f} L"
+        f"sortie {sortie.number:3}  fill to {row['fill_l']:6.2f} L, spray {row['needs_l']:6.2f} L"
         f"  {row['airborne_s'] / 60.0:5.1f} min from {sortie.start_s / 60.0:.0f} min  "
         f"{counted(sortie.lines, 'line')}, {_speeds(sortie.speeds_m_s)}, "
         f"{row['items']} mission items (the autopilot holds {ITEMS_MAX[plan.settings.autopilot]}), "

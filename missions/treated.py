@@ -21,11 +21,14 @@ from companion.core.options.lines import (
     ENTRY_SHARE,
     JERK_M_S3,
     JERK_SEEN_S,
+    SWERVES_M_S,
 )
+from companion.core.safety import SPEED_MARGIN_M_S
 from missions.boom import boom_of
 from missions.corners import NOSE_DEG_S
 from missions.coverage import CELL_M, CELLS_MAX
 from missions.demand import Rates, valve_places
+from missions.maps.compiling import JOINED_M
 from missions.plan import Plan, Settings, Sortie, Treated, flown_lines
 from missions.stops import Track, timed, track_of
 from missions.strips import Bools, Extents, Floats, extents_of, sprayed_twice, whole
@@ -35,8 +38,6 @@ from missions.surroundings import OVERRUN_M, RunIn, with_run_ins
 STEP_S, STEPS_MAX = 0.05, 200_000
 # Places across a valve's strip that are looked at for treated ground.
 ACROSS = 5
-# From a state at which the companion has valves open, or closed, to the change on the ground.
-OPENS_S, CLOSES_S = 0.3, 0.2
 STRAIGHT_M = 0.01
 
 
@@ -60,8 +61,8 @@ def treated_by(plan: Plan, rates: Rates) -> Treated:
     )
     total_s = max(plan.flight_s, 1.0)
     step_s = max(STEP_S, total_s / STEPS_MAX)
-    swept = [rule.swept(sortie, step_s) for sortie in plan.sorties]
-    strips = np.array([shape for shapes, _ in swept for shape in shapes], dtype=object)
+    swept = {sortie.number: rule.swept(sortie, step_s) for sortie in plan.sorties}
+    strips = np.array([shape for shapes, _ in swept.values() for shape in shapes], dtype=object)
     treated = whole(strips)
     bare = _rated(shapely.difference(limit, treated), rates)
     ground_m2 = float(bare.area + treated.intersection(limit).area)
@@ -69,7 +70,7 @@ def treated_by(plan: Plan, rates: Rates) -> Treated:
         ground_m2=ground_m2,
         bare=bare,
         twice=sprayed_twice(strips),
-        volume_l=sum(volume_l for _, volume_l in swept),
+        litres={number: volume_l for number, (_, volume_l) in swept.items()},
     )
 
 
@@ -106,16 +107,20 @@ class _Rule:
         velocity = np.gradient(track.places, step_s, axis=0)
         found: list[BaseGeometry] = []
         volume_l = 0.0
-        for way, _, from_m, to_m in track.parts:
+        for way, from_m, to_m in _joined(track, self.settings.lines_course_deg):
             mine = np.flatnonzero(track.way == way)
             if len(mine) < 2:
                 continue
+            own = len(mine)
+            if to_m == math.inf:
+                # No gap to the next way.
+                mine = np.append(mine, min(mine[-1] + 1, len(track.way) - 1))
             passed = _Pass(
                 track=track, at=mine, velocity=velocity, nose=nose, from_m=from_m, to_m=to_m
             )
             is_open, flow_l_min = self.open(passed, found)
             found += passed.strips(is_open, self.valves)
-            volume_l += float(flow_l_min[is_open].sum()) * step_s / 60.0
+            volume_l += float(flow_l_min[:own][is_open[:own]].sum()) * step_s / 60.0
         return found, volume_l
 
     def open(self, passed: _Pass, done: list[BaseGeometry]) -> tuple[Bools, Floats]:
@@ -125,11 +130,12 @@ class _Rule:
         middle = passed.places[:, None] + passed.right[:, None] * right_m[:, None]
         flat = middle.reshape(-1, 2)
         rate = np.nan_to_num(self.rates.rates_at(flat[:, 0], flat[:, 1])).reshape(swept_m_s.shape)
-        least = 0.0 if settings.flow_l_min is None else settings.flow_l_min[0] / 2.0
+        low, high = settings.flow_l_min or (0.0, math.inf)
         flow = flow_for_rate(1.0, 1.0, settings.swath_width_m) * rate * swept_m_s
-        found: Bools = (flow > 0.0) & (flow >= least)
-        for acts_s in (OPENS_S, CLOSES_S):
-            found &= passed.may_spray(settings, acts_s)[:, None]
+        found: Bools = (flow > 0.0) & (flow >= low / 2.0)
+        flow = np.clip(flow, low, high)
+        found &= passed.may_spray(settings, settings.opens_s, SPEED_MARGIN_M_S)[:, None]
+        found &= passed.may_spray(settings, settings.closes_s, 0.0)[:, None]
         half_m = width_m / 2.0 * np.abs(passed.right @ passed.unit)[:, None]
         along_m = (middle - passed.start) @ passed.unit
         found &= (along_m >= passed.from_m + half_m) & (along_m <= passed.to_m - half_m)
@@ -157,6 +163,36 @@ class _Rule:
                 is_done |= shapely.contains_xy(shape, points)
         found: Floats = is_done.reshape(len(passed.at), len(self.valves), ACROSS).mean(axis=2)
         return found
+
+
+def _joined(track: Track, bend_deg: float) -> list[tuple[int, float, float]]:
+    """Return the (way, from_m, to_m) of lines; where one goes on in another, and between, no end.
+
+    The companion reads such lines as one (`missions.maps.compiling`).
+    """
+    found: list[tuple[int, float, float]] = []
+    for way, _, from_m, to_m in track.parts:
+        last, first_m, end_m = found[-1] if found else (-1, 0.0, 0.0)
+        if found and _goes_on(track, (last, way), (end_m, from_m), bend_deg):
+            found.pop()
+            if last == way:
+                from_m = first_m
+            else:
+                found.append((last, first_m, math.inf))
+                found += [(between, -math.inf, math.inf) for between in range(last + 1, way)]
+                from_m = -math.inf
+        found.append((way, from_m, to_m))
+    return found
+
+
+def _goes_on(
+    track: Track, ways: tuple[int, int], along_m: tuple[float, float], bend_deg: float
+) -> bool:
+    starts, ends = np.hsplit(track.ends[list(ways)], 2)
+    unit = (ends - starts) / np.hypot(*(ends - starts).T)[:, None]
+    one, other = starts + unit * np.array(along_m)[:, None]
+    is_gentle = float(unit[0] @ unit[1]) >= math.cos(math.radians(bend_deg))
+    return is_gentle and math.dist(one, other) < JOINED_M
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -206,17 +242,19 @@ class _Pass:
         """Return values of the track so long before."""
         return values[np.maximum(self.at - round(ago_s / self.track.step_s), 0)]
 
-    def may_spray(self, settings: Settings, acts_s: float) -> Bools:
+    def may_spray(self, settings: Settings, acts_s: float, more_m_s: float) -> Bools:
         """Return where the aircraft was fast enough and on its line (`Lines.flown`) so long ago."""
         unit, bend = self.unit, math.tan(math.radians(settings.lines_course_deg))
         aside = np.array([unit[1], -unit[0]])
-        soon_s = min(CLOSES_S, COURSE_AHEAD_S)
-        swerves = JERK_M_S3 * soon_s * (0.5 * soon_s + JERK_SEEN_S)
+        soon_s = min(settings.ends_s, COURSE_AHEAD_S)
         now, gain = self._before(self.velocity, acts_s), self._before(self.gain, acts_s)
+        speed = np.hypot(*now.T)
+        swerves = JERK_M_S3 * soon_s * (0.5 * soon_s + JERK_SEEN_S)
+        swerves = swerves * np.minimum(speed / SWERVES_M_S, 1.0)
         found: Bools = np.abs((self.places - self.start) @ aside) <= (
             ENTRY_SHARE * settings.lines_aside_m
         )
-        found &= np.hypot(*now.T) >= settings.speeds_m_s[0]
+        found &= speed >= settings.speeds_m_s[0] + more_m_s
         for then, more in ((now, 0.0), (now + gain * soon_s, swerves)):
             found &= np.abs(then @ aside) + more <= bend * (then @ unit)
         return found
@@ -269,7 +307,7 @@ def _nose(track: Track, settings: Settings) -> Floats:
 # In words, with the reason for what stays bare, and what ways outside the field would change.
 
 # Less of the field is not worth a way out of it.
-WORTH_PERCENT = 2.0
+WORTH_PERCENT = 1.0
 
 
 def treated_lines(plan: Plan, rates: Rates, *, has_runs: bool) -> list[str]:
@@ -284,7 +322,7 @@ def treated_lines(plan: Plan, rates: Rates, *, has_runs: bool) -> list[str]:
         f"treated   {said['treated_percent']:.1f} %: {said['bare_m2']:.0f} m2 stay bare "
         f"({under_m2:.0f} where a pass begins, ends or touches the border, "
         f"{said['bare_m2'] - under_m2:.0f} beside the passes), {said['twice_m2']:.0f} m2 twice, "
-        f"with {found.volume_l:.2f} L"
+        f"with {said['treated_l']:.2f} L"
     ]
     if not has_runs and 100.0 * under_m2 > WORTH_PERCENT * found.ground_m2:
         other = _with_overrun(plan)
@@ -295,6 +333,18 @@ def treated_lines(plan: Plan, rates: Rates, *, has_runs: bool) -> list[str]:
             f"{(other.flight_s - plan.flight_s) / 60.0:.1f} min more"
         )
     return lines
+
+
+def thirsty_warnings(plan: Plan) -> tuple[str, ...]:
+    """Return which sorties put out more than their tank holds for them, and why."""
+    usable_l = plan.settings.usable_l
+    return tuple(
+        f"sortie {sortie.number} puts out {plan.needs_l(sortie):.2f} L, and {usable_l:.2f} L of "
+        "the tank are no reserve: nozzles give their least flow where it is slow; plan it again "
+        "with a higher mission.reserve_l"
+        for sortie in plan.sorties
+        if plan.needs_l(sortie) > usable_l + 0.005
+    )
 
 
 def _with_overrun(plan: Plan) -> Plan:

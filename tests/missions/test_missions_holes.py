@@ -16,7 +16,8 @@ from shapely import Point, Polygon, box
 from companion.cli.app import execute
 from missions.demand import Uniform
 from missions.errors import PlanError
-from missions.field import build_field
+from missions.field import both_ways, build_field, frame_of
+from missions.maps.compiling import read_plan_lines
 from missions.plan import Settings
 from missions.planner import plan_mission
 from tests.bench.missions import FRAME, random_field, to_degrees
@@ -162,3 +163,20 @@ def test_no_leg_of_any_field_comes_nearer_than_is_kept(seed: int, kept_m: float)
         if len(leg.points) > 1
     ]  # fmt: skip
     assert shapely.union_all(ways).distance(shapely.union_all(holes)) >= kept_m - DIGITS_M
+
+
+def test_the_lines_that_a_flight_reads_go_on_over_no_hole(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    field = written(FIELD, tmp_path / "f.geojson")
+    found, _ = planned(capsys, field, "--out", tmp_path / "m.plan", "--json")
+    frame = frame_of(shapely.from_geojson(field.read_text()))
+    lines = read_plan_lines(Path(found["lines_file"]), frame)
+    # Lines are joined where one goes on in the next: never across what is kept off.
+    read_m = sum(shapely.LineString(line).length for line in lines)
+    assert read_m == pytest.approx(found["spray_m"], rel=0.01)
+    drawn = shapely.get_parts(both_ways(shapely.from_geojson(field.read_text()), frame))
+    holes = [Polygon(ring) for part in drawn for ring in part.interiors]
+    assert len(holes) == 2
+    for line in lines:
+        assert shapely.LineString(line).distance(shapely.union_all(holes)) > KEPT_M - DIGITS_M

@@ -142,9 +142,11 @@ def test_what_is_in_the_tank_is_not_mixed_again(
     # More than the first sortie needs serves the next one too, and nothing is poured out.
     small = made("--in-tank-l", 9.0, "--rate-l-ha", 5.0)
     first = small["sorties"][0]
-    assert first["add_l"] == pytest.approx(max(first["volume_l"] + RESERVE_L - 9.0, 0.0))
+    assert first["add_l"] == pytest.approx(max(first["needs_l"] + RESERVE_L - 9.0, 0.0))
+    # At 5 L/ha nozzles give more than is asked, and that is gone too.
     total_l = sum(one["add_l"] for one in small["sorties"])
-    assert small["mix"]["leftover_l"] == pytest.approx(9.0 + total_l - small["volume_l"])
+    assert small["treated_l"] > small["volume_l"]
+    assert small["mix"]["leftover_l"] == pytest.approx(9.0 + total_l - small["treated_l"])
     sheet = tmp_path / "sheet.txt"
     made("--in-tank-l", 4.0, "--sheet", sheet)
     assert "beside the 4 L that are in the tank" in sheet.read_text()

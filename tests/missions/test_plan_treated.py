@@ -14,7 +14,8 @@ from missions.field import build_field
 from missions.plan import Settings
 from missions.planner import plan_mission
 from missions.reading import Asked, read_task
-from missions.treated import treated_by, treated_lines
+from missions.sheet import filled_of
+from missions.treated import thirsty_warnings, treated_by, treated_lines
 from tests.bench.plan_treated import of_field, write
 from tests.mission_fields import degrees
 
@@ -102,3 +103,21 @@ def test_the_answer_says_what_stays_bare_and_what_ways_outside_would_spare() -> 
     assert "m2 stay bare" in said
     assert 'mission.overrun = "allowed"' in price
     assert treated_lines(plan, rates, has_runs=True) == [said]
+
+
+def test_tanks_are_filled_for_what_falls_where_nozzles_give_more_than_is_asked() -> None:
+    # 14 m are too short for the speed, and below it nozzles give their least.
+    ground = build_field(degrees(shapely.box(0.0, 0.0, 30.0, 14.0)), swath_width_m=6.0)
+    rates = Uniform(rate_l_ha=9.0)
+    plan = plan_mission(ground, settings(), rates)
+    plan = replace(plan, treated=treated_by(plan, rates))
+    (sortie,) = plan.sorties
+    falls_l = plan.needs_l(sortie)
+    assert falls_l > sortie.volume_l
+    assert filled_of(plan)[1]["fill_l"] == pytest.approx(falls_l + plan.settings.reserve_l)
+    assert thirsty_warnings(plan) == ()
+    tight = replace(plan.settings, tank_l=sortie.volume_l + plan.settings.reserve_l)
+    plan = replace(plan, settings=tight)
+    assert filled_of(plan)[1]["fill_l"] == pytest.approx(tight.tank_l)
+    (said,) = thirsty_warnings(plan)
+    assert said.startswith(f"sortie 1 puts out {falls_l:.2f} L")
