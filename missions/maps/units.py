@@ -36,7 +36,7 @@ _LITRES: dict[str, tuple[float, str]] = {
     "imp gal": (4.54609, r"imp(?:erial)?\.?gal(?:lon)?s?|uk\.?gal(?:lon)?s?"),
     "qt": (3.785411784 / 4, r"qts?|quarts?"),
     "pt": (3.785411784 / 8, r"pts?|pints?"),
-    "fl oz": (3.785411784 / 128, r"fl\.?oz|fluidounces?|floz"),
+    "fl oz": (3.785411784 / 128, r"fl[._-]?oz|fluid[._-]?ounces?"),
 }
 # Hectares of each area. 1 ac = 4 046.8564224 m2 (international acre); 1 mu is 1/15 ha.
 _HECTARES: dict[str, tuple[float, str]] = {
@@ -72,7 +72,7 @@ _MINUTES: dict[str, tuple[float, str]] = {
     "h": (60.0, r"h|hrs?|hours?"),
 }
 _MASS = r"(?:k|m|µ|u)?g|kgs?|kilo(?:gram)?s?|grams?|t|to|tons?|tonnes?|lbs?|pounds?|oz|cwt|dt"
-_BY = r"(?:1?(?:/|per|p[ao]r|pro|je|na|на|ανα|[·.*_-])1?)"
+_BY = r"(?:1?(?:/|_?(?:per|p[ao]r|pro|je|na|на|ανα)_?|[·.*_-])1?)"
 _SEPARATOR = f"(?:{_BY}|1?)"
 # What is counted, measured along a line, harvested, or a part of what is weighed: units of other
 # machines' maps, which no density, width or speed turns into litres.
