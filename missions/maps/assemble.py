@@ -50,8 +50,9 @@ from missions.maps.overlaps import check_crossings
 _NAME_COLUMNS = ("name", "zonename", "zone", "zoneid", "zone_id", "label", "id", "fid", "level")
 
 _CRS_FIX = "give it with --crs (--crs EPSG:4326 for GPS coordinates), or copy the missing file"
-# Less does not show in the figures.
-_SAME_M2 = 0.005
+# Less does not show in the figures. More, and more than a hundredth of the zone, and nobody knows
+# which of the loops was meant as ground.
+_SAME_M2, _MEANT_M2, _MEANT_SHARE = 0.005, 1.0, 0.01
 _PROJECTION_FIX = "give with --crs the projection that it was made in, or copy the missing file"
 
 
@@ -93,9 +94,12 @@ def repair_problems(repairs: Sequence[Repair]) -> list[Problem]:
             f"{total_m2:.2f} m2 in all, and {worst.change_m2:.2f} m2 in the worst "
             f"({worst.reason})"
         )
+    unclear = any(
+        not repair.change_m2 <= max(_MEANT_M2, _MEANT_SHARE * repair.after_m2) for repair in repairs
+    )
     return [
         Problem(
-            severity="warning",
+            severity="error" if unclear else "warning",
             code="invalid-ring",
             text=text,
             where=worst.zone,

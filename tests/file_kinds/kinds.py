@@ -33,6 +33,8 @@ BY_HAND = ("GeoJSON by hand",)
 TURNED = Polygon(FIELD.exterior.coords, [ISLAND.exterior.coords[::-1]])
 ALIKE = Polygon(FIELD.exterior.coords[::-1], [ISLAND.exterior.coords[::-1]])
 NESTED = MultiPolygon([FIELD, ISLAND])
+# One ring: round the field, in through a slit, round the pond the same way, and out again.
+SLIT = Polygon([*FIELD.exterior.coords, *ISLAND.exterior.coords, FIELD.exterior.coords[0]])
 
 
 def zones(*rates: float | None) -> Callable[[], Ground]:
@@ -112,10 +114,22 @@ OF_ZONES = [
         may=TOLD,
         formats=tuple(name for name in writers.VECTOR if "shapefile" not in name),
     ),
+    Kind(
+        name="a pond drawn as a zone without a rate",
+        make=lambda: with_hole((FIELD, ISLAND), rate=[20.0, None]),
+        may=TOLD,
+        formats=COLUMNS,
+    ),
     Kind(name="a zone drawn twice", make=lambda: _twice(20.0), may=SURE),
     Kind(name="two rates on one ground", make=lambda: _twice(26.0), may=ASKED),
     Kind(name="one zone over the edge of another", make=lambda: _over(), may=ASKED),
     Kind(name="a bow tie", make=lambda: _bow_tie(), may=TOLD, formats=BY_HAND),
+    Kind(
+        name="a pond cut out through a slit, its ring turned on",
+        make=lambda: with_hole((SLIT,)),
+        may=TOLD,
+        formats=(*BY_HAND, "GeoPackage"),
+    ),
     Kind(
         name="deleted record",
         make=lambda: replace(three_zones((20.0, 26.0, None)), columns={"rate": [20.0, 26.0, 30.0]}),
@@ -396,6 +410,21 @@ OF_UNITS = (
             may=ASKED,
         )
         for text in ("kg/ha", "l/hl", "m", "%", "L", "L/min", "seeds/m2", "")
+    ]
+    + [
+        Kind(
+            name=f"a column {name}",
+            make=partial(columned, tuple(rate * factor for rate in _RATES), **{name: _LISTED}),
+            options=(),
+            formats=("shapefile", "GeoJSON"),
+            may=OR_ASKED,
+        )
+        for name, factor in (
+            ("fl_oz_ac", GPA / 128),
+            ("l_per_ac", 1 / 0.40468564224),
+            ("gal_ac", GPA),
+            ("litros_ha", 1.0),
+        )
     ]
     + [
         Kind(

@@ -25,11 +25,11 @@ def page() -> str:
     outcomes, parts = recorded(), [INTRODUCTION]
     for rule, kinds in RULES.items():
         found = outcomes[rule]
-        formats = list(dict.fromkeys(name for kind in kinds for name in found[kind.name]))
+        formats = list(dict.fromkeys(name for kind in kinds for name in found.get(kind.name, {})))
         rows: dict[str, dict[str, set[str]]] = {}
         for kind in kinds:
             row = rows.setdefault(kind.row or kind.name, {})
-            for name, outcome in found[kind.name].items():
+            for name, outcome in found.get(kind.name, {}).items():
                 row.setdefault(name, set()).add(WORDS[outcome])
         parts.append(f"\n## {rule}\n\n| | {' | '.join(formats)} |\n|---{'|---' * len(formats)}|")
         parts += [

@@ -13,10 +13,11 @@ from shapely.errors import ShapelyError
 from companion.cli.answer import problem_object
 from companion.core.frame import WGS84
 from missions.maps.cells import shares_inside, to_degrees
-from missions.maps.lint.survey import Survey, area_text, latitude_longitude
+from missions.maps.lint.survey import Ints, Survey, area_text, latitude_longitude
 from missions.maps.lint.zones import Plan, overlap_problems, shape_problems, short_problems
 from missions.maps.local import project
-from missions.maps.model import MapCells, MapFile, Problem, map_error
+from missions.maps.model import MapCells, MapFile, Problem, Severity, map_error
+from missions.maps.outlines import INSIDE_SHARE, SAME_SHARE
 from missions.maps.overlaps import check_outline
 from missions.maps.totals import Totals, totals
 
@@ -242,18 +243,37 @@ def _null_rate(survey: Survey, default_rate_l_ha: float | None) -> Problem:
     then = "the valves close there"
     if default_rate_l_ha is not None and survey.boundary is not None:
         then = f"inside the boundary the default rate of {default_rate_l_ha:g} L/ha falls there"
+    severity: Severity = "warning" if survey.rated.any() else "error"
+    fix = "give them a rate, 0 for none"
     if survey.cells is not None:
         what, where = "cells", survey.cell_spots(~survey.rated)
     else:
         what, where = "zones", survey.zone_spots(np.flatnonzero(~survey.rated).tolist())
+        under = _under(survey) if survey.is_simple else np.array([], dtype=np.int64)
+        if under.size:
+            # An island or a pond as a record of its own, of which a program knows no rate.
+            severity, fix = "error", "draw them as holes of the zone around them"
+            then = f"{under.size} of them lie in a zone with a rate, which falls there too"
+            where = survey.zone_spots(under.tolist())
     return Problem(
-        severity="warning" if survey.rated.any() else "error",
+        severity=severity,
         code="null-rate",
         text=f"{int((~survey.rated).sum())} of {survey.rates.size} {what} without a rate, "
         f"{survey.hectares(~survey.rated):.3f} ha in all{_bare_text(survey)}; {then}",
         where=where,
-        fix="give them a rate, 0 for none",
+        fix=fix,
     )
+
+
+def _under(survey: Survey) -> Ints:
+    """Return the zones without a rate that lie, but for a border, in a larger one with a rate."""
+    none, rated = survey.local[~survey.rated], survey.local[survey.rated]
+    inner, outer = shapely.STRtree(rated).query(none, predicate="intersects")
+    shared = shapely.area(shapely.intersection(none[inner], rated[outer]))
+    size = shapely.area(none)[inner]
+    inside = (shared >= INSIDE_SHARE * size) & (size < SAME_SHARE * shapely.area(rated)[outer])
+    found: Ints = np.flatnonzero(~survey.rated)[np.unique(inner[inside])]
+    return found
 
 
 def _bare_text(survey: Survey) -> str:
