@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from companion.cli.answer import AsJson, JournalFile, answer, new_app, note
+from companion.wording import CUT
 
 if TYPE_CHECKING:
     from analysis.replay import ReplayResult
@@ -118,7 +119,7 @@ def _notes(result: ReplayResult) -> list[str]:
     if result.lost:
         notes.append(f"{result.lost} rows are missing in the journal: differences may follow")
     if not result.is_closed:
-        notes.append("the flight was cut off: its last second may be missing")
+        notes.append(CUT)
     if not result.decisions:
         notes.append("the journal has no decisions")
     return notes

@@ -17,6 +17,9 @@ from companion.errors import ConfigError
 # What a computer is for: the extras of pyproject.toml.
 Role = Literal["vehicle", "office", "campaign", "cluster"]
 
+# How much is missing nobody knows: a second after a power cut, more after a disk that fell behind.
+CUT = "the journal was cut: what came after its end is missing"
+
 
 def counted(count: int, name: str) -> str:
     """Return a number with its noun.

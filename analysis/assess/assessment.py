@@ -41,6 +41,7 @@ from analysis.student import (
     t_factor,
 )
 from companion.core.inputs import Fix
+from companion.wording import CUT
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -539,7 +540,7 @@ def _notes(flight: AppliedFlight) -> Iterable[str]:
     if not np.isfinite(flight.changes.actual_s).any():
         yield "the output did not tell when it gave its orders: planned times are used"
     if not flight.is_closed:
-        yield "the journal was cut off: its last second may be missing"
+        yield CUT
     if flight.lost:
         yield f"{flight.lost} rows are missing in the journal"
 

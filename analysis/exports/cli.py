@@ -13,6 +13,7 @@ import typer
 from analysis.exports.output import ExportError
 from analysis.exports.source import Shape
 from companion.cli.answer import AsJson, JournalFiles, answer, new_app, note
+from companion.wording import CUT
 
 if TYPE_CHECKING:
     from analysis.exports.columns import System
@@ -311,7 +312,7 @@ def _check_free(out: Path, *, force: bool) -> None:
 def _warnings(flight: AppliedFlight) -> list[str]:
     found = []
     if not flight.is_closed:
-        found.append("the flight was cut off: its last second may be missing")
+        found.append(CUT)
     if flight.lost:
         found.append(f"{flight.lost} rows are missing in the journal")
     return found

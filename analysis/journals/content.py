@@ -45,7 +45,7 @@ class JournalContent:
 
     @property
     def is_closed(self) -> bool:
-        """Whether the flight ended in order; otherwise its last second may be missing."""
+        """Whether the flight ended in order; otherwise what came after its end is missing."""
         return self.meta.get("closed") == "yes"
 
     @property

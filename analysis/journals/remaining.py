@@ -159,7 +159,7 @@ def _lines(result: Mapping[str, Any]) -> Iterator[str]:
     if result["unread"]:
         yield "a journal is damaged: more may be treated than could be read"
     elif not result["is_exact"]:
-        yield "a flight was cut off: its last second of spraying is worked out, not known"
+        yield "a flight was cut off: what it sprayed after the end of its journal is not known"
 
 
 def _place(latitude_deg: float, longitude_deg: float) -> dict[str, float]:

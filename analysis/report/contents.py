@@ -22,6 +22,7 @@ from analysis.report.legal_fields import wind_note
 from companion.cli.answer import finite
 from companion.core.types import Inhibit
 from companion.simulated import SIMULATED
+from companion.wording import CUT
 
 if TYPE_CHECKING:
     from analysis.assess.assessment import Assessment, Figures
@@ -399,7 +400,8 @@ def _training(flight: AppliedFlight) -> Iterator[Caution]:
 
 def _journal(flight: AppliedFlight, clock: Clock) -> Iterator[Caution]:
     if not flight.is_closed:
-        yield _warning("cut", "The journal was cut: up to its last second is missing.")
+        end = f"{CUT} (it ends {flight.duration_s:.0f} s after its start)."
+        yield _warning("cut", end[0].upper() + end[1:])
     if flight.lost:
         yield _warning("rows-lost", f"{flight.lost} rows of the journal are lost.")
     if not clock.is_verified:

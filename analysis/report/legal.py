@@ -27,6 +27,7 @@ from analysis.report.clock import SOURCES
 from analysis.report.legal_fields import FIELDS, LABELS, REAL_FLIGHT, Facts, label_of
 from companion.config.application_table import Profile, is_told
 from companion.config.legal_entries import ASKED, missing
+from companion.wording import CUT
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -265,7 +266,7 @@ def _remarks(told: Told, facts: Facts) -> Iterator[str]:
     elif facts.clock_source != "autopilot":
         yield f"times are by the {SOURCES[facts.clock_source]}"
     if not facts.is_closed:
-        yield "the journal was cut; up to its last second may be missing"
+        yield CUT
     if facts.wind_note:
         yield facts.wind_note
     if facts.simulated.is_simulated:

@@ -45,7 +45,7 @@ from analysis.wsp.stains import SPREADS, THRESHOLD, Threshold, spread_of
 from companion.atomic_write import write_atomically
 from companion.cli.answer import AsJson, answer, new_app, note
 from companion.errors import ConfigError, JournalError
-from companion.wording import writing
+from companion.wording import CUT, writing
 
 if TYPE_CHECKING:
     from analysis.flown.applied_flight import AppliedFlight
@@ -291,7 +291,7 @@ def read_flown(journal: Path) -> Flown:
         return Flown(warnings=(str(error),))
     found = []
     if not flight.is_closed:
-        found.append("the flight was cut off: its last second may be missing")
+        found.append(CUT)
     if flight.lost:
         found.append(f"{flight.lost} rows are missing in the journal")
     if not len(flight.time_s):

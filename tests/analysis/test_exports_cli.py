@@ -18,6 +18,7 @@ from analysis.exports.output import ExportError, write_beside, write_folder
 from companion.cli.app import execute
 from companion.errors import ConfigError
 from companion.journal.journal import Journal
+from companion.wording import CUT
 from tests.analysis.export_flight import fly
 from tests.builders import setup
 
@@ -168,8 +169,8 @@ def test_a_cut_journal_gives_what_there_is_and_a_warning(
     said = capsys.readouterr()
     answer = json.loads(said.out)
     assert (answer["is_closed"], answer["flight"]) == (False, "flight-0009")
-    assert answer["warnings"] == ["the flight was cut off: its last second may be missing"]
-    assert "warning: the flight was cut off" in said.err
+    assert answer["warnings"] == [CUT]
+    assert f"warning: {CUT}" in said.err
     facts = json.loads((out / "f.geojson").read_text())["vrspray"]
     assert facts["is_closed"] is False
 
