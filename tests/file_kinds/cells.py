@@ -142,6 +142,7 @@ RASTERS = [
         beside=26.0,
     ),
     _raster("255 for no data, not said", _holed(), TOLD, stored=_filled(255), dtype="uint8"),
+    _raster("254 for no data, not said", _holed(), TOLD, stored=_filled(254), dtype="uint8"),
     _raster("65535 for no data, not said", _holed(), TOLD, stored=_filled(65535), dtype="uint16"),
     _raster("scale inside", GRID, stored=GRID * 10, dtype="int16", scale=0.1),
     _raster(

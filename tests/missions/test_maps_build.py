@@ -176,6 +176,7 @@ def problem_zones() -> list[tuple[str, Sequence[tuple[Polygon, float | None]]]]:
         ("far-apart", [(cell(0), 1.0), (cell(300), 1.0)]),
         ("all-zero", [(cell(0), 0.0)]),
         ("high-rate", [(cell(0), 5_000.0)]),
+        ("rate-apart", [(cell(0), 20.0), (cell(1), 24.0), (cell(2), 254.0)]),
         ("null-rate", [(cell(0), None), (cell(1), 1.0)]),
         ("odd-place", [(box(0.0, 0.0, CELL, CELL), 1.0)]),
         ("odd-place", [(box(36.0, 81.0, 36.0 + CELL, 81.0 + CELL), 1.0)]),
@@ -185,6 +186,10 @@ def problem_zones() -> list[tuple[str, Sequence[tuple[Polygon, float | None]]]]:
 @pytest.mark.parametrize(("code", "zones"), problem_zones())
 def test_every_oddity_is_told(code: str, zones: Sequence[tuple[Polygon, float | None]]) -> None:
     assert code in codes(a_map(*zones))
+
+
+def test_rates_a_few_times_apart_are_no_oddity() -> None:
+    assert codes(a_map((cell(0), 0.0), (cell(1), 5.0), (cell(2), 40.0))) == []
 
 
 def test_a_sound_map_has_no_problems() -> None:

@@ -13,7 +13,7 @@ from shapely.errors import ShapelyError
 from companion.cli.answer import problem_object
 from companion.core.frame import WGS84
 from missions.maps.cells import shares_inside, to_degrees
-from missions.maps.lint.survey import Ints, Survey, area_text, latitude_longitude
+from missions.maps.lint.survey import Floats, Ints, Survey, area_text, latitude_longitude
 from missions.maps.lint.zones import Plan, overlap_problems, shape_problems, short_problems
 from missions.maps.local import project
 from missions.maps.model import MapCells, MapFile, Problem, Severity, map_error
@@ -177,6 +177,8 @@ def _unusable(map_file: MapFile, error: ShapelyError) -> Exception:
 RATE_HIGH_L_HA = 2_000.0
 # Even ultra-low-volume spraying puts down more, as a rule 1 to 5 L/ha; NDVI lies below 1.
 RATE_LOW_L_HA = 1.0
+# The rates of a map lie within a few times of each other; codes like 254 or 999 do not.
+RATE_APART_TIMES = 8.0
 # A map drawn by hand never meets its boundary exactly: this share of the field is let pass.
 SHARE_MIN = 0.002
 AREA_MIN_M2 = 1.0
@@ -214,6 +216,13 @@ def rate_problems(survey: Survey, default_rate_l_ha: float | None) -> list[Probl
                 fix="write 0 where nothing may fall, and leave out the zones that mean nothing",
             )
         )
+    return [*problems, *_sizes(survey, rates, most)]
+
+
+def _sizes(survey: Survey, rates: Floats, most: float) -> list[Problem]:
+    """Return rates that are too small or too large for any, or for the others of this map."""
+    problems, column = [], survey.map_file.rate_field
+    others = rates[rates < most]
     if 0.0 < most < RATE_LOW_L_HA:
         problems.append(
             Problem(
@@ -221,7 +230,7 @@ def rate_problems(survey: Survey, default_rate_l_ha: float | None) -> list[Probl
                 code="low-rate",
                 text=f"the largest rate is {most:g} L/ha: values from 0 to 1 look like a "
                 "vegetation index or a share, and not like litres",
-                where=f"{survey.map_file.rate_field}: {survey.rate_spots(most)}",
+                where=f"{column}: {survey.rate_spots(most)}",
                 fix="check the rate column (--rate-field) and its unit (--unit); an index has to "
                 "be turned into rates first",
             )
@@ -232,8 +241,19 @@ def rate_problems(survey: Survey, default_rate_l_ha: float | None) -> list[Probl
                 severity="warning",
                 code="high-rate",
                 text=f"the largest rate is {most:.0f} L/ha, more than any sprayer applies",
-                where=f"{survey.map_file.rate_field}: {survey.rate_spots(most)}",
+                where=f"{column}: {survey.rate_spots(most)}",
                 fix="check the rate column (--rate-field) and its unit (--unit)",
+            )
+        )
+    if others.size and 0.0 < others.max() * RATE_APART_TIMES < most <= RATE_HIGH_L_HA:
+        problems.append(
+            Problem(
+                severity="warning",
+                code="rate-apart",
+                text=f"the largest rate is {most:g} L/ha, and all others at most "
+                f"{others.max():g}: it may be a code for no data, or a slip",
+                where=f"{column}: {survey.rate_spots(most)}",
+                fix="correct it where the map is made, if nobody meant it",
             )
         )
     return problems
