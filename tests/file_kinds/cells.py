@@ -229,5 +229,10 @@ POINTS = [
     _csv("UTF-16", ASKED | SURE, encoding="utf-16"),
     _csv("three rows once more", SURE, more=_FIRST),
     _csv("another rate at one place", ASKED, more=[(*_FIRST[0][:2], 40.0)]),
+    _csv(
+        "another rate a centimetre away",
+        ASKED,
+        more=[(_FIRST[0][0] + 1e-7, _FIRST[0][1], 40.0)],
+    ),
     _csv("names the wrong way round", TOLD, given=HERE, names=("lat", "lon", "rate")),
 ]  # fmt: skip
