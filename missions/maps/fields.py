@@ -223,9 +223,9 @@ def _candidates(columns: Sequence[Source], path: Path) -> list[Source]:
         path,
         f"no band looks like a rate; there are {typed(numeric) or 'none'}"
         if several
-        else f"no column looks like a rate; its numeric columns are {typed(numeric) or 'none'}"
-        + (f", and {totals} is a total by its name" if totals else ""),
-        fix=_NAME_IT,
+        else f"no column looks like a rate; it has {typed(numeric) or 'no column of numbers'}"
+        + (f"; {totals} is a total by its name" if totals else ""),
+        fix=_NAME_IT if numeric else "give its zones a column of numbers with their rates",
         code="several-products" if several else "no-rate-column",
     )
 

@@ -272,7 +272,7 @@ def test_a_bad_rate_is_named_by_its_line(tmp_path: Path) -> None:
 def test_a_bad_rate_does_not_hide_among_its_neighbours(tmp_path: Path) -> None:
     generator = np.random.default_rng(3)
     at = generator.random((200, 2)) * 20 * CELL + (SOUTH, WEST)
-    at[77] = at[76] + 1e-7
+    at[77] = at[76] + 4e-6
     rows = [f"{lat:.7f},{lon:.7f},20" for lat, lon in at]
     rows[77] = rows[77].replace(",20", ",-9")
     path = tmp_path / "rx.csv"
