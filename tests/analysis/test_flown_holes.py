@@ -43,7 +43,7 @@ def damaged(journal: Path, tmp_path: Path) -> Callable[[str], Path]:
 
 
 def litres(flight: AppliedFlight) -> float:
-    return float(record_of(flight, step_s=0.05).volume_ml[-1].sum()) / 1000.0
+    return float(record_of(flight).volume_ml[-1].sum()) / 1000.0
 
 
 def test_a_sound_journal_has_no_holes(journal: Path) -> None:
