@@ -145,7 +145,7 @@ def grounds(draw: st.DrawFn) -> Polygon | MultiPolygon:
     return MultiPolygon(parts) if len(parts) > 1 else parts[0]
 
 
-RATES = st.none() | st.floats(0.0, 5000.0)
+RATES = st.none() | st.integers(0, 500_000).map(lambda hundredths: hundredths / 100)
 
 
 @settings(max_examples=60)
@@ -169,7 +169,14 @@ def test_what_is_written_comes_back(
     WRITERS[suffix](written, path, boundary=boundary)
     found = understood(path)
     assert found.unit == "L/ha"
-    for one, two in zip(found.zones, written, strict=True):
+    # The same ground with the same rate once more is no other zone.
+    rates = [one.rate_l_ha for one in written]
+    once = [
+        one
+        for number, one in enumerate(written)
+        if one.rate_l_ha is None or one.rate_l_ha not in rates[:number]
+    ]
+    for one, two in zip(found.zones, once, strict=True):
         assert (one.rate_l_ha is None) == (two.rate_l_ha is None)
         assert one.rate_l_ha == pytest.approx(two.rate_l_ha, abs=0.01)
         assert (one.part_count, one.hole_count) == (two.part_count, two.hole_count)
