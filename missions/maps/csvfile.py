@@ -135,7 +135,8 @@ def _grid(table: Table, place: tuple[str, ...], sha256: str) -> Grid:
             code="no-rate-column",
         )
     # Programs round coordinates each in its own way: a decimetre apart is one place.
-    places = _Places(table, np.round(x + 1j * y, 6 if in_degrees else 1))
+    digits = 6 if in_degrees else 1
+    places = _Places(table, np.round(x, digits) + 1j * np.round(y, digits))
     once = {name: numbers[places.first] for name, numbers in values.items()}
     cells = cells_of_degrees if in_degrees else cells_of_coordinates
     crs, transform, grids, at, problems = cells(x[places.first], y[places.first], once, table.path)
