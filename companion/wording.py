@@ -126,7 +126,9 @@ def writing(named: str) -> Iterator[None]:
         ) from error
 
 
-def read_toml(path: Path, *, what: str, named: str = "") -> tuple[str, dict[str, Any]]:
+def read_toml(
+    path: Path, *, what: str, named: str = "", bytes_max: int = TOML_MAX_BYTES
+) -> tuple[str, dict[str, Any]]:
     """Return the text and the tables of a TOML file, which is to be one of `what`.
 
     Raises:
@@ -136,8 +138,8 @@ def read_toml(path: Path, *, what: str, named: str = "") -> tuple[str, dict[str,
     fix = f"give the .toml file of {what}"
     try:
         with path.open("rb") as file:
-            content = file.read(TOML_MAX_BYTES + 1)
-        if len(content) > TOML_MAX_BYTES:
+            content = file.read(bytes_max + 1)
+        if len(content) > bytes_max:
             raise ConfigError(f"{named}: too large; {fix}")
         text = content.decode("utf-8-sig")
         return text, tomllib.loads(text)

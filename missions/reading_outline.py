@@ -32,7 +32,7 @@ T = TypeVar("T")
 
 # The nearest land is 1.4 degrees south and 5.6 east of 0, 0.
 AT_SEA_DEG = 1.0
-# 1 km at 26 degrees of latitude; beyond that less, and more than a fence needs.
+# 1.1 km at the equator, 0.5 km at 63 degrees of latitude: more than a fence or a turn needs.
 MERIDIAN_DEG = 0.01
 
 
@@ -167,7 +167,7 @@ def check_degrees(area: Area, path: Path) -> None:
         raise PlanError(
             f"{path}: the outline lies at the 180th meridian ({west:.5f} to "
             f"{east:.5f}), over which no autopilot's fence can be drawn; plan the ground on one "
-            "side, a kilometre from it"
+            f"side, {MERIDIAN_DEG:g} degrees from it"
         )
     beside = west <= AT_SEA_DEG and east >= -AT_SEA_DEG
     if beside and south <= AT_SEA_DEG and north >= -AT_SEA_DEG:

@@ -20,8 +20,10 @@ from pydantic import Field, FiniteFloat, ValidationError, model_validator
 from companion.config.tables import Buffer, Rate, Table, Text, Texts, contradiction
 from companion.core.label import LabelLimits, Span, is_from
 from companion.core.types import Inhibit
+from companion.errors import ConfigError
 from companion.wording import read_toml
 
+SIZE_MAX_BYTES = 100_000
 # Where the journal keeps them.
 LIMITS_META = "limits_json"
 DAY = r"^[0-9]{4}-[0-9]{2}-[0-9]{2}$"
@@ -313,5 +315,8 @@ def read_limits(path: Path, named: str) -> LimitsFile:
     Raises:
         ConfigError: in one line: file, key, value, what to write instead.
     """
-    _, raw = read_toml(path, what="label and permit", named=named)
+    what = "label and permit"
+    if not path.is_file():  # a pipe would keep the start waiting
+        raise ConfigError(f"{named}: no such file; give the .toml file of {what}")
+    _, raw = read_toml(path, what=what, named=named, bytes_max=SIZE_MAX_BYTES)
     return LimitsFile.checked(raw, path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import tomllib
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -84,8 +85,9 @@ def test_a_wrong_file_is_refused_in_one_line(tmp_path: Path, text: str, wrong: s
 
 
 def test_a_file_that_is_not_there_or_is_no_file_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "large.toml").write_bytes(b"#" * 1_000_001)
-    for name in ("none.toml", ".", "large.toml"):
+    (tmp_path / "large.toml").write_bytes(b"#" * 100_001)
+    os.mkfifo(tmp_path / "pipe.toml")
+    for name in ("none.toml", ".", "large.toml", "pipe.toml"):
         with pytest.raises(ConfigError, match=r"limits\.file"):
             read_limits(tmp_path / name, "limits.file")
 

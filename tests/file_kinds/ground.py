@@ -6,11 +6,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import shapely
-from pyproj import Geod, Transformer
-from shapely import MultiPolygon, Point, Polygon, box
+from pyproj import Transformer
+from shapely import Polygon, box
 
 WEST_DEG, SOUTH_DEG = 11.0, 48.0
-LOCAL = "+proj=aeqd +lat_0=48 +lon_0=11 +datum=WGS84 +units=m"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,12 +67,6 @@ def _through(way: Transformer) -> Any:
     return there
 
 
-def area_m2(*areas: shapely.Geometry) -> float:
-    """Return the geodesic area of polygons in degrees."""
-    geod = Geod(ellps="WGS84")
-    return sum(abs(geod.geometry_area_perimeter(shapely.orient_polygons(one))[0]) for one in areas)
-
-
 def three_zones(rates: tuple[float | None, ...] = (20.0, 26.0, 0.0)) -> Ground:
     """Return three zones side by side, 30 m wide and of different depth."""
     depths = (60.0, 48.0, 36.0)
@@ -101,9 +94,3 @@ def with_hole(polygons: tuple[shapely.Geometry, ...], **columns: list[Any]) -> G
         truth=((*IN_ISLAND, None), (*OUT_OF_ISLAND, 20.0)),
         area_m2=HOLED.area,
     )
-
-
-__all__ = [
-    "FIELD", "HOLED", "ISLAND", "Ground", "MultiPolygon", "Point", "area_m2", "three_zones",
-    "with_hole",
-]  # fmt: skip
